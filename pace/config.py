@@ -1,0 +1,420 @@
+"""Typed configuration: one dataclass per group of ``configs/``, and the check of YAML against it.
+
+Every number of the task, the physics and the learning lives in the YAML files, with its unit and source. The classes
+here say which keys exist and of what type they are; an unknown key, a wrong type or a value out of range raises
+:class:`ConfigError` with the key's full name.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, is_dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+Range = list[float]
+T = TypeVar("T")
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot be used; the message names the key and the cure."""
+
+
+def config_dir() -> Path:
+    """Folder of the YAML files: inside an installed wheel, or at the root of a checkout."""
+    here = Path(__file__).resolve().parent
+    for candidate in (here / "configs", here.parent / "configs"):
+        if candidate.is_dir():
+            return candidate
+    raise ConfigError(f"no configs/ folder beside {here}: reinstall pace-table-tennis or run from a checkout")
+
+
+def _require(condition: bool, message: str) -> None:
+    if not condition:
+        raise ConfigError(message)
+
+
+def _check_range(name: str, value: Range, lowest: float | None = None) -> None:
+    _require(len(value) == 2, f"{name} must be [low, high], got {value}")
+    _require(value[0] <= value[1], f"{name}: low {value[0]} is above high {value[1]}")
+    if lowest is not None:
+        _require(value[0] >= lowest, f"{name}: {value[0]} is below {lowest}")
+
+
+@dataclass
+class JointGroup:
+    """Gains and limits of the joints whose name contains one of ``match``."""
+
+    match: list[str]
+    kp: float  # N m / rad
+    kd: float  # N m s / rad
+    effort: float  # N m
+
+
+@dataclass
+class RobotConfig:
+    """The robot: control rate, gains, nominal pose."""
+
+    name: str
+    control_dt: float  # s
+    action_scale: float  # rad per unit of action
+    action_clip: float  # largest |action|
+    armature: float  # kg m^2
+    base_height: float  # m, base above the floor at reset
+    joint_groups: list[JointGroup]  # the first match of a joint counts
+    nominal_pose: dict[str, float]  # rad; joints not named stand at 0
+
+    def __post_init__(self) -> None:
+        _require(self.control_dt > 0, "robot.control_dt must be positive")
+        _require(self.action_clip > 0, "robot.action_clip must be positive")
+
+
+@dataclass
+class TableConfig:
+    """Table, net, floor and paddle as the ball meets them (world frame: origin on the floor under the table's centre)."""
+
+    length: float  # m, along x
+    width: float  # m, along y
+    height: float  # m, top above the floor
+    thickness: float  # m
+    net_height: float  # m above the top
+    net_overhang: float  # m past each side line
+    paddle_radius: float  # m
+    paddle_half_thickness: float  # m, blade and rubber
+    floor_restitution: float
+    floor_friction: float
+    net_restitution: float
+    net_friction: float
+
+
+@dataclass
+class BallConfig:
+    """Ball, air and contacts. Restitution is ``e0 - slope * |v_n|``, never below ``min_restitution``."""
+
+    name: str
+    mass: float  # kg
+    radius: float  # m
+    air_density: float  # kg / m^3
+    drag_coefficient: float
+    magnus_coefficient: float
+    table_restitution: float
+    table_restitution_slope: float  # s / m
+    table_friction: float
+    paddle_restitution: float
+    paddle_restitution_slope: float  # s / m
+    paddle_friction: float
+    table: TableConfig
+    min_restitution: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("mass", "radius"):
+            _require(getattr(self, name) > 0, f"ball.{name} must be positive")
+        for name in ("table_restitution", "paddle_restitution"):
+            _require(0 <= getattr(self, name) <= 1, f"ball.{name} must lie in [0, 1]")
+
+
+@dataclass
+class ServeConfig:
+    """Where serves start and how fast they are, and when a serve is over."""
+
+    name: str
+    x: Range  # m
+    y: Range  # m
+    z: Range  # m
+    vx: Range  # m/s
+    vy: Range  # m/s
+    vz: Range  # m/s
+    spin: Range  # rad/s, each axis
+    max_duration: float  # s since the serve began
+    end_after_hit: float  # s after the paddle hit; 0 switches it off
+    end_height: float  # m; a ball below it ends the serve
+    serves_per_episode: int  # 0: the worlds play on without end
+    random_phase: bool  # first episodes begin at a random serve, so that resets spread over time
+
+    def __post_init__(self) -> None:
+        for name in ("x", "y", "z", "vx", "vy", "vz", "spin"):
+            _check_range(f"serve.{name}", getattr(self, name))
+        _require(self.max_duration > 0, "serve.max_duration must be positive")
+        _require(self.serves_per_episode >= 0, "serve.serves_per_episode must be 0 (no end) or more")
+
+
+@dataclass
+class ResetConfig:
+    """Where the robot starts, and where an episode is lost."""
+
+    base_x: Range  # m, world
+    base_y: Range  # m, world
+    yaw: Range  # rad
+    linear_velocity: Range  # m/s, each axis
+    roll_pitch_rate: Range  # rad/s
+    yaw_rate: Range  # rad/s
+    joint_scale: Range  # legs, waist and left arm: nominal times this
+    right_arm_offset: Range  # rad: right arm: nominal plus this
+    min_base_height: float  # m; below it the robot has fallen
+    bounds_x: Range  # m
+    bounds_y: Range  # m
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            if f.name != "min_base_height":
+                _check_range(f"reset.{f.name}", getattr(self, f.name))
+
+
+@dataclass
+class RewardTerm:
+    """One term: its weight, multiplied by the control step, and the numbers that it needs."""
+
+    weight: float
+    params: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass
+class RewardConfig:
+    """The reward: its terms by name, the target that the hit terms share, and the scale that the learner sees."""
+
+    name: str
+    scale: float  # the learner sees scale * sum of the terms
+    target_x: float  # m; the paddle's target is the apex, or where the ball later passes this x
+    target_mode: str  # "intercept": later of apex and x = target_x; "clamp": apex with its x clamped (released code)
+    arm_offset: list[float]  # m; base target = target_xy + arm_offset
+    idle_base_xy: list[float]  # m; base target while there is nothing to hit
+    nothing_to_hit: dict[str, float]  # past_x, low_z, falling_x (m): when the prediction terms are off
+    terms: dict[str, RewardTerm]
+
+    def __post_init__(self) -> None:
+        _require(self.target_mode in ("intercept", "clamp"), "reward.target_mode must be intercept or clamp")
+
+
+@dataclass
+class RandomizationConfig:
+    """Per-world draws at each reset. ``[1, 1]`` scales and ``[0, 0]`` offsets are a clean run."""
+
+    name: str
+    friction: Range  # sliding friction of robot bodies with floor and table
+    trunk_mass: Range  # kg added
+    trunk_com: Range  # m added, each axis
+    kp_scale: Range
+    kd_scale: Range
+    armature_scale: Range
+    effort_scale: Range
+    actuator_delay: Range  # s
+    push_velocity: Range  # m/s, x and y, added to the base
+    push_interval: Range  # s between pushes; [0, 0] is no push
+    ball_mass_scale: Range
+    drag_scale: Range
+    magnus: Range  # added to the Magnus coefficient
+    table_restitution: Range  # added
+    table_friction: Range  # added
+    paddle_restitution: Range  # added
+    paddle_friction: Range  # added
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            if f.name != "name":
+                _check_range(f"randomization.{f.name}", getattr(self, f.name))
+
+
+@dataclass
+class SensingConfig:
+    """What the robot's sensors add to the truth: uniform noise (+- amplitude) and delay."""
+
+    name: str
+    base_angular_velocity: float  # rad/s
+    base_position: float  # m
+    projected_gravity: float
+    joint_position: float  # rad
+    joint_velocity: float  # rad/s
+    ball_position: float  # m
+    heading: float
+    base_shift: float  # m
+    mocap_delay: Range  # s, drawn per world at reset: ball, base position and heading
+
+
+@dataclass
+class ObservationConfig:
+    """Names of the observations of each network, in order, and how many control steps of history each sees."""
+
+    name: str
+    policy: list[str]
+    critic: list[str]
+    policy_history: int
+    critic_history: int
+
+    def __post_init__(self) -> None:
+        _require(self.policy_history >= 1, "observation.policy_history must be at least 1")
+        _require(self.critic_history >= 1, "observation.critic_history must be at least 1")
+
+
+@dataclass
+class EngineConfig:
+    """The physics engine and its solver."""
+
+    name: str  # auto, native, mjwarp
+    physics_dt: float  # s
+    solver_iterations: int
+    line_search_iterations: int
+    cone: str  # pyramidal, elliptic
+    threads: int  # native: 0 is all cores
+    contacts_per_world: int  # mjwarp: room for contacts
+    constraints_per_world: int  # mjwarp: room for constraint rows
+    paddle_reaction: bool  # the ball's impulse acts on the paddle over the next control step
+    ball_dt: float  # s, longest sub-step of the ball's flight
+
+    def __post_init__(self) -> None:
+        _require(self.name in ("auto", "native", "mjwarp"), f"engine must be auto, native or mjwarp, not {self.name!r}")
+        _require(self.physics_dt > 0, "engine.physics_dt must be positive")
+        _require(self.cone in ("pyramidal", "elliptic"), "engine.cone must be pyramidal or elliptic")
+
+
+@dataclass
+class SchedulePoint:
+    """A value from ``samples`` control steps on; between points it is interpolated linearly."""
+
+    samples: float
+    value: float
+
+
+@dataclass
+class AlgoConfig:
+    """Asymmetric PPO."""
+
+    name: str
+    steps: int  # control steps a world plays per update
+    epochs: int
+    minibatches: int
+    actor_hidden: list[int]
+    critic_hidden: list[int]
+    gamma: float
+    gae_lambda: float
+    clip: float
+    value_coefficient: float
+    clip_value: bool
+    entropy: list[SchedulePoint]
+    std: list[SchedulePoint]  # upper limit of the policy's standard deviation; the first value is the initial one
+    std_floor: float
+    learning_rate: float
+    learning_rate_min: float
+    learning_rate_max: float
+    kl_target: float
+    max_grad_norm: float
+    observation_clip: float
+    last_layer_gain: float
+    autocast: str  # auto (bf16 where the hardware has it), bf16, fp32
+
+    def __post_init__(self) -> None:
+        _require(self.autocast in ("auto", "bf16", "fp32"), "algo.autocast must be auto, bf16 or fp32")
+        _require(0 < self.gamma <= 1, "algo.gamma must lie in (0, 1]")
+        for name in ("steps", "epochs", "minibatches"):
+            _require(getattr(self, name) >= 1, f"algo.{name} must be at least 1")
+        for name in ("entropy", "std"):
+            _require(len(getattr(self, name)) >= 1, f"algo.{name} needs at least one point")
+
+
+@dataclass
+class PredictorConfig:
+    """The learned predictor of the ball's apex and its online regression."""
+
+    name: str
+    frames: int  # past ball positions it sees
+    hidden: list[int]
+    learning_rate: float
+    batch_size: int
+    batches_per_update: int
+    train_updates: int  # frozen afterwards; 0 trains it to the end
+    outputs: list[str]  # of apex (3), target (3), target_time (1)
+    enabled: bool  # off: the actor sees zeros instead (ablation)
+
+
+@dataclass
+class SimConfig:
+    """What the physics worlds need: a part of every command's configuration."""
+
+    robot: RobotConfig
+    ball: BallConfig
+    engine: EngineConfig
+    randomization: RandomizationConfig
+
+    @property
+    def substeps(self) -> int:
+        """Physics steps of one control step."""
+        count = round(self.robot.control_dt / self.engine.physics_dt)
+        _require(
+            count >= 1 and abs(count * self.engine.physics_dt - self.robot.control_dt) < 1e-9,
+            f"engine.physics_dt {self.engine.physics_dt} must divide robot.control_dt {self.robot.control_dt}",
+        )
+        return count
+
+
+@dataclass
+class TaskConfig(SimConfig):
+    """The table-tennis task: the worlds, and what is asked, sensed and rewarded in them."""
+
+    serve: ServeConfig
+    reset: ResetConfig
+    reward: RewardConfig
+    sensing: SensingConfig
+    observation: ObservationConfig
+    predictor: PredictorConfig
+
+
+@dataclass
+class TrainConfig(TaskConfig):
+    """``python -m pace.rl.train``: the task, the learner and the run."""
+
+    algo: AlgoConfig
+    name: str
+    num_worlds: int
+    device: str  # auto, cpu, cuda, cuda:1
+    seed: int
+    samples: float  # control steps in all; whichever of samples and minutes ends first
+    minutes: float  # wall-clock; 0: no limit
+    run_dir: str | None  # null: runs/<date>_<name>
+    resume: str | None  # a run folder or checkpoint to go on from
+    init_from: str | None  # a run folder or checkpoint whose weights to start from
+    checkpoint_minutes: float
+    tensorboard: bool
+    progress: bool
+
+    def __post_init__(self) -> None:
+        _require(self.num_worlds >= 1, f"num_worlds must be at least 1, got {self.num_worlds}")
+        _require(self.samples > 0, "samples must be positive")
+        _require(not (self.resume and self.init_from), "give resume or init_from, not both")
+
+
+def parse(config: DictConfig | dict[str, Any], schema: type[T]) -> T:
+    """Check ``config`` against a dataclass and return an instance of it.
+
+    Errors: :class:`ConfigError` that names the key, for an unknown or missing key, a wrong type or a bad value.
+    """
+    plain = config if isinstance(config, DictConfig) else OmegaConf.create(config)
+    try:
+        OmegaConf.resolve(plain)
+        merged = OmegaConf.merge(OmegaConf.structured(schema), plain)
+        return OmegaConf.to_object(merged)  # type: ignore[return-value]
+    except OmegaConfBaseException as error:
+        key = getattr(error, "full_key", None) or "?"
+        reason = str(error).split("\n")[0]
+        raise ConfigError(f"configuration key '{key}': {reason}") from error
+
+
+def compose(config_name: str, overrides: list[str] | None = None) -> DictConfig:
+    """Compose ``configs/<config_name>.yaml`` with Hydra overrides, for tests, notebooks and rebuilt runs."""
+    from hydra import compose as hydra_compose
+    from hydra import initialize_config_dir
+
+    with initialize_config_dir(config_dir=str(config_dir()), version_base="1.3"):
+        return hydra_compose(config_name=config_name, overrides=overrides or [])
+
+
+def load_train_config(overrides: list[str] | None = None) -> TrainConfig:
+    """The training configuration of ``configs/train.yaml`` with Hydra overrides such as ``["num_worlds=64"]``."""
+    return parse(compose("train", overrides), TrainConfig)
+
+
+def to_dict(config: Any) -> dict[str, Any]:
+    """A dataclass of this module as plain nested dictionaries, ready for YAML or JSON."""
+    if not is_dataclass(config):
+        raise ConfigError(f"not a configuration: {type(config).__name__}")
+    return OmegaConf.to_container(OmegaConf.structured(config))  # type: ignore[return-value]
