@@ -1,0 +1,103 @@
+"""Per-world draws of robot, motor, ball, air and contact parameters, and of pushes.
+
+Draws are made for all worlds and kept where a mask says so, so that a reset never waits for the host.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from pace.config import BallConfig, ConfigError, RandomizationConfig
+from pace.sim.ball import BallParams
+from pace.sim.engine import EngineParams
+
+#: Engine parameters that are drawn straight from the range of the same name.
+ENGINE_DRAWS = ("friction", "trunk_mass", "trunk_com", "kp_scale", "kd_scale", "armature_scale", "effort_scale")
+#: Ball parameter -> (range, whether the draw scales the nominal value or is added to it).
+BALL_DRAWS = {
+    "mass": ("ball_mass_scale", True),
+    "drag_coefficient": ("drag_scale", True),
+    "magnus_coefficient": ("magnus", False),
+    "table_restitution": ("table_restitution", False),
+    "table_friction": ("table_friction", False),
+    "paddle_restitution": ("paddle_restitution", False),
+    "paddle_friction": ("paddle_friction", False),
+}
+#: Restitution above one would create energy; friction below zero would too.
+BALL_LIMITS = {"table_restitution": (0.0, 1.0), "paddle_restitution": (0.0, 1.0)}
+
+
+class Randomizer:
+    """Draws the parameters of N worlds at reset, and the pushes in between.
+
+    Attributes: ``actuator_delay`` (N,) s; ``push`` (N, nv) velocity to add to the generalized velocity before the
+    next control step (m/s on the base's x and y, zero elsewhere).
+    """
+
+    def __init__(
+        self,
+        config: RandomizationConfig,
+        ball: BallConfig,
+        engine_params: EngineParams,
+        ball_params: BallParams,
+        generator: torch.Generator,
+        num_velocities: int,
+        control_dt: float,
+    ) -> None:
+        self.config = config
+        self._engine_params = engine_params
+        self._ball_params = ball_params
+        self._nominal_ball = {name: float(getattr(ball, name)) for name in BALL_DRAWS}
+        self._generator = generator
+        self._control_dt = control_dt
+        if not 0.0 <= config.actuator_delay[0] <= config.actuator_delay[1] <= control_dt:
+            raise ConfigError(f"randomization.actuator_delay must lie within one control step (0 to {control_dt} s)")
+        num_worlds, device = engine_params.friction.shape[0], engine_params.friction.device
+        self.actuator_delay = torch.zeros(num_worlds, device=device)
+        self.push = torch.zeros(num_worlds, num_velocities, device=device)
+        self.pushes_enabled = config.push_interval[1] > 0.0
+        self._until_push = torch.zeros(num_worlds, device=device)
+        self.draw(torch.ones(num_worlds, dtype=torch.bool, device=device))
+
+    def _uniform(self, bounds: list[float], shape: torch.Size) -> Tensor:
+        sample = torch.rand(shape, device=self.actuator_delay.device, generator=self._generator)
+        return sample.mul_(bounds[1] - bounds[0]).add_(bounds[0])
+
+
+    def draw(self, mask: Tensor) -> None:
+        """Draw new parameters for the worlds of ``mask`` (N,) bool."""
+        for name in ENGINE_DRAWS:
+            self._assign(mask, getattr(self._engine_params, name), getattr(self.config, name))
+        self._assign(mask, self.actuator_delay, self.config.actuator_delay)
+        self._assign(mask, self._until_push, self.config.push_interval)
+        for name, (range_name, scales) in BALL_DRAWS.items():
+            target: Tensor = getattr(self._ball_params, name)
+            sample = self._uniform(getattr(self.config, range_name), target.shape)
+            sample = sample.mul_(self._nominal_ball[name]) if scales else sample.add_(self._nominal_ball[name])
+            low, high = BALL_LIMITS.get(name, (0.0, float("inf")))
+            target.copy_(torch.where(mask, sample.clamp_(low, high), target))
+
+    def _assign(self, mask: Tensor, target: Tensor, bounds: list[float]) -> None:
+        wide = mask if target.dim() == 1 else mask.unsqueeze(-1)
+        target.copy_(torch.where(wide, self._uniform(bounds, target.shape), target))
+
+    def update_push(self) -> Tensor:
+        """Advance the push timers by one control step; return ``push`` (N, nv), zero where no push is due."""
+        self._until_push -= self._control_dt
+        due = self._until_push < 0.0
+        self._assign(due, self._until_push, self.config.push_interval)
+        sample = self._uniform(self.config.push_velocity, self.push[:, :2].shape)
+        self.push[:, :2] = sample * due.unsqueeze(-1)
+        return self.push
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Everything that was drawn, for an exact resume."""
+        state = {f"engine.{name}": getattr(self._engine_params, name) for name in ENGINE_DRAWS}
+        state |= {f"ball.{name}": getattr(self._ball_params, name) for name in BALL_DRAWS}
+        return state | {"actuator_delay": self.actuator_delay, "until_push": self._until_push}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Put back what :meth:`state_dict` returned; shapes must match."""
+        for name, tensor in self.state_dict().items():
+            tensor.copy_(state[name])

@@ -1,0 +1,255 @@
+"""N worlds of robot and ball: one control step of physics, resets by mask, and the state that a task reads."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from pace.config import SimConfig
+from pace.sim.ball import BallParams, BallSim
+from pace.sim.engine import make_engine, resolve_device
+from pace.sim.kinematics import Kinematics
+from pace.sim.randomization import Randomizer
+from pace.sim.robot import JOINT_NAMES, build_model, nominal_pose
+
+
+@dataclass(frozen=True)
+class RobotState:
+    """The robot at the end of the last control step: tensors (N, ...), float32, world frame unless said.
+
+    The tensors are the same objects for ever and are overwritten by each step. Contact forces, body contacts and
+    joint torques belong to the last physics step.
+    """
+
+    joint_position: Tensor  # (N, 21) rad
+    joint_velocity: Tensor  # (N, 21) rad/s
+    joint_acceleration: Tensor  # (N, 21) rad/s^2, mean over the control step
+    joint_torque: Tensor  # (N, 21) N m
+    base_position: Tensor  # (N, 3) m
+    base_quat: Tensor  # (N, 4) w, x, y, z
+    base_linear_velocity: Tensor  # (N, 3) m/s
+    base_angular_velocity: Tensor  # (N, 3) rad/s, body frame
+    projected_gravity: Tensor  # (N, 3) unit vector, body frame
+    heading: Tensor  # (N, 2) the base's x axis on the ground, unit vector
+    paddle_position: Tensor  # (N, 3) m, centre of the blade
+    paddle_normal: Tensor  # (N, 3) unit vector
+    paddle_velocity: Tensor  # (N, 3) m/s
+    foot_position: Tensor  # (N, 2, 3) m, left and right
+    foot_velocity: Tensor  # (N, 2, 3) m/s
+    foot_up: Tensor  # (N, 2, 3) unit vector, the foot's z axis
+    foot_force: Tensor  # (N, 2, 3) N
+    body_contact: Tensor  # (N, B) 1 where a body other than the feet touches something
+    head_position: Tensor  # (N, 3) m
+
+
+@wp.kernel
+def _derive(
+    qpos: wp.array3d(dtype=wp.float32),
+    qvel: wp.array3d(dtype=wp.float32),
+    last: int,
+    inverse_dt: float,
+    gravity: wp.array2d(dtype=wp.float32),
+    heading: wp.array2d(dtype=wp.float32),
+    acceleration: wp.array2d(dtype=wp.float32),
+):
+    """Gravity in the body frame, heading on the ground and mean joint acceleration of one world."""
+    world = wp.tid()
+    w = qpos[world, last, 3]
+    x = qpos[world, last, 4]
+    y = qpos[world, last, 5]
+    z = qpos[world, last, 6]
+    gravity[world, 0] = 2.0 * (w * y - x * z)
+    gravity[world, 1] = -2.0 * (y * z + w * x)
+    gravity[world, 2] = 2.0 * (x * x + y * y) - 1.0
+    forward = 1.0 - 2.0 * (y * y + z * z)
+    left = 2.0 * (x * y + w * z)
+    length = wp.max(wp.sqrt(forward * forward + left * left), 1.0e-6)
+    heading[world, 0] = forward / length
+    heading[world, 1] = left / length
+    for joint in range(acceleration.shape[1]):
+        change = qvel[world, last, 6 + joint] - qvel[world, 0, 6 + joint]
+        acceleration[world, joint] = change * inverse_dt
+
+
+class Worlds:
+    """Robot and ball in N worlds. ``step`` is one control step; nothing in it waits for the host.
+
+    Args:
+        config: robot, ball, engine and randomisation.
+        num_worlds: N.
+        device: ``auto``, ``cpu``, ``cuda`` or ``cuda:1``; ``auto`` takes the first GPU where there is one.
+        generator: source of every random draw, on the worlds' device; ``None`` makes one with seed 0.
+    """
+
+    joint_names = JOINT_NAMES
+
+    def __init__(
+        self,
+        config: SimConfig,
+        num_worlds: int,
+        device: str | torch.device = "auto",
+        generator: torch.Generator | None = None,
+    ) -> None:
+        self.config = config
+        self.num_worlds = num_worlds
+        self.device = resolve_device(device)
+        self.control_dt = config.robot.control_dt
+        self.generator = generator or torch.Generator(self.device).manual_seed(0)
+        self.model = build_model(config.robot, config.engine, config.ball.table)
+        self.engine = make_engine(self.model, config.engine, num_worlds, self.device, config.substeps)
+        self.kinematics = Kinematics(self.model, num_worlds, config.substeps, self.device)
+        self.ball = BallSim(
+            num_worlds,
+            self.device,
+            BallParams.from_config(config.ball),
+            config.ball.table,
+            self.control_dt,
+            config.substeps,
+            config.engine.ball_dt,
+        )
+        self.randomizer = Randomizer(
+            config.randomization,
+            config.ball,
+            self.engine.params,
+            self.ball.params,
+            self.generator,
+            self.model.nv,
+            self.control_dt,
+        )
+        self.engine.apply_params(torch.ones(num_worlds, dtype=torch.bool, device=self.device))
+        self._allocate()
+
+    def _allocate(self) -> None:
+        n, device, joints = self.num_worlds, self.device, len(JOINT_NAMES)
+        self.nominal = torch.as_tensor(nominal_pose(self.config.robot), dtype=torch.float32, device=device)
+        limits = torch.as_tensor(self.model.jnt_range[1:], dtype=torch.float32, device=device)
+        self.joint_lower, self.joint_upper = limits[:, 0].contiguous(), limits[:, 1].contiguous()
+        self._gravity = torch.zeros(n, 3, device=device)
+        self._heading = torch.zeros(n, 2, device=device)
+        self._acceleration = torch.zeros(n, joints, device=device)
+        self._previous_targets = self.nominal.repeat(n, 1)
+        self._targets = torch.zeros(n, self.config.substeps, joints, device=device)
+        self._new_share = torch.zeros(n, self.config.substeps, 1, device=device)
+        self._applied = torch.zeros(n, self.model.nv, device=device)
+        starts = torch.arange(1, self.config.substeps + 1, device=device, dtype=torch.float32)
+        self._substep_ends = (starts * self.config.engine.physics_dt).unsqueeze(0)
+        self._derive_command = wp.launch(
+            _derive,
+            dim=n,
+            inputs=[
+                wp.from_torch(self.engine.qpos_path),
+                wp.from_torch(self.engine.qvel_path),
+                self.config.substeps,
+                1.0 / self.control_dt,
+                wp.from_torch(self._gravity),
+                wp.from_torch(self._heading),
+                wp.from_torch(self._acceleration),
+            ],
+            device=wp.device_from_torch(self.device),
+            record_cmd=True,
+        )
+        self.robot = self._robot_state()
+        self._update_delay()
+
+    def _robot_state(self) -> RobotState:
+        qpos, qvel = self.engine.qpos_path[:, -1], self.engine.qvel_path[:, -1]
+        paddle = self.kinematics.paddle_path[:, -1]
+        return RobotState(
+            joint_position=qpos[:, 7:],
+            joint_velocity=qvel[:, 6:],
+            joint_acceleration=self._acceleration,
+            joint_torque=self.engine.joint_torque,
+            base_position=qpos[:, :3],
+            base_quat=qpos[:, 3:7],
+            base_linear_velocity=qvel[:, :3],
+            base_angular_velocity=qvel[:, 3:6],
+            projected_gravity=self._gravity,
+            heading=self._heading,
+            paddle_position=paddle[:, :3],
+            paddle_normal=paddle[:, 3:6],
+            paddle_velocity=paddle[:, 6:9],
+            foot_position=self.kinematics.foot_position,
+            foot_velocity=self.kinematics.foot_velocity,
+            foot_up=self.kinematics.foot_up,
+            foot_force=self.engine.foot_force,
+            body_contact=self.engine.body_contact,
+            head_position=self.kinematics.head_position,
+        )
+
+    def step(self, targets: Tensor) -> None:
+        """One control step towards joint targets (N, 21) rad; ``robot``, ``ball`` and ``ball.events`` are new after it.
+
+        Order: targets pass the actuator delay (a physics step in which the new target arrives gets the mean of both),
+        pushes and the ball's last impulse on the paddle act, the robot moves, then the ball flies the same interval
+        along the paddle's path.
+        """
+        change = (targets - self._previous_targets).unsqueeze(1)
+        torch.mul(self._new_share, change, out=self._targets)
+        self._targets += self._previous_targets.unsqueeze(1)
+        self._previous_targets.copy_(targets)
+        if self.randomizer.pushes_enabled:
+            self.engine.add_velocity(self.randomizer.update_push())
+        if self.config.engine.paddle_reaction:
+            self._react()
+        self.engine.advance(self._targets, self._applied)
+        self._observe()
+        self.ball.fly(self.kinematics.paddle_path)
+
+    def _react(self) -> None:
+        """Spread the ball's last impulse on the paddle over the coming control step, at the same point of the blade."""
+        events = self.ball.events
+        arm = events.hit_offset - events.hit_normal * self.config.ball.radius
+        force = events.paddle_impulse / self.control_dt
+        self.kinematics.paddle_generalized_force(force, self.robot.paddle_position + arm, self._applied)
+
+    def _observe(self) -> None:
+        self.kinematics.update(self.engine.qpos_path, self.engine.qvel_path)
+        self._derive_command.launch()
+
+    def _update_delay(self) -> None:
+        """Share of each physics step that is left once the new target has passed the actuator delay."""
+        dt = self.config.engine.physics_dt
+        share = (self._substep_ends - self.randomizer.actuator_delay.unsqueeze(1)) / dt
+        self._new_share.copy_(share.clamp_(0.0, 1.0).unsqueeze(-1))
+
+    def reset_robot(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
+        """Put the robots of ``mask`` (N,) bool into state qpos (N, 28), qvel (N, 27) and draw their parameters anew."""
+        self.randomizer.draw(mask)
+        self._update_delay()
+        self.engine.apply_params(mask)
+        self.engine.reset(mask, qpos, qvel)
+        wide = mask.unsqueeze(-1)
+        self._previous_targets.copy_(torch.where(wide, qpos[:, 7:], self._previous_targets))
+        self.ball.events.paddle_impulse.masked_fill_(wide, 0.0)
+        self._observe()
+
+    def serve(self, mask: Tensor, position: Tensor, velocity: Tensor, spin: Tensor) -> None:
+        """Start the ball of the worlds of ``mask`` at position (N, 3) m, velocity (N, 3) m/s, spin (N, 3) rad/s."""
+        wide = mask.unsqueeze(-1)
+        for target, value in zip((self.ball.position, self.ball.velocity, self.ball.spin), (position, velocity, spin)):
+            target.copy_(torch.where(wide, value, target))
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """All that the next control step depends on, besides the random generator."""
+        events = {f"event.{f.name}": getattr(self.ball.events, f.name) for f in fields(self.ball.events)}
+        ball = {"position": self.ball.position, "velocity": self.ball.velocity, "spin": self.ball.spin}
+        drawn = {f"drawn.{name}": value for name, value in self.randomizer.state_dict().items()}
+        engine = {f"engine.{name}": value for name, value in self.engine.state_dict().items()}
+        return ball | events | drawn | engine | {"previous_targets": self._previous_targets}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Put back what :meth:`state_dict` returned."""
+        prefix = "drawn."
+        self.randomizer.load_state_dict({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
+        self._update_delay()
+        everyone = torch.ones(self.num_worlds, dtype=torch.bool, device=self.device)
+        self.engine.apply_params(everyone)
+        prefix = "engine."
+        self.engine.load_state_dict({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
+        for name, tensor in self.state_dict().items():
+            if not name.startswith(("drawn.", "engine.")):
+                tensor.copy_(state[name])
+        self._observe()

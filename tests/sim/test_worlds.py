@@ -1,0 +1,119 @@
+"""Worlds: delays, pushes, randomisation and the paddle's reaction, against numbers."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from pace.config import ConfigError, TaskConfig, load_train_config
+from pace.sim.worlds import Worlds
+
+CLEAN = ["randomization=none", "engine=native", "engine.physics_dt=0.005"]
+
+
+def make_worlds(num_worlds: int = 4, *overrides: str) -> Worlds:
+    config: TaskConfig = load_train_config([*CLEAN, *overrides])
+    return Worlds(config, num_worlds, "cpu", torch.Generator().manual_seed(3))
+
+
+def stand(worlds: Worlds) -> None:
+    """All robots in the nominal pose, feet on the floor."""
+    n = worlds.num_worlds
+    qpos = torch.zeros(n, 28)
+    qpos[:, 0], qpos[:, 2], qpos[:, 3] = -2.0, 0.70, 1.0
+    qpos[:, 7:] = worlds.nominal
+    worlds.reset_robot(torch.ones(n, dtype=torch.bool), qpos, torch.zeros(n, 27))
+
+
+def test_targets_arrive_after_the_actuator_delay() -> None:
+    worlds = make_worlds(1)
+    stand(worlds)
+    worlds.randomizer.actuator_delay.fill_(0.007)
+    worlds._update_delay()
+    worlds.step(worlds.nominal + 0.1)
+    # 7 ms into physics steps of 5 ms: nothing, 3 of 5 ms, all, all
+    share = (worlds._targets[0, :, 0] - worlds.nominal[0]) / 0.1
+    torch.testing.assert_close(share, torch.tensor([0.0, 0.6, 1.0, 1.0]), atol=1e-5, rtol=0.0)
+
+
+def test_a_delay_longer_than_a_control_step_is_refused() -> None:
+    with pytest.raises(ConfigError, match="actuator_delay"):
+        make_worlds(1, "randomization.actuator_delay=[0.0,0.03]")
+
+
+def test_randomised_parameters_stay_in_range_and_change_only_masked_worlds() -> None:
+    config = load_train_config(["randomization=full", "engine=native"])
+    worlds = Worlds(config, 64, "cpu")
+    before = {name: value.clone() for name, value in worlds.randomizer.state_dict().items()}
+    mask = torch.arange(64) % 2 == 0
+    worlds.randomizer.draw(mask)
+    nominal = config.ball.paddle_restitution
+    low, high = (nominal + x for x in config.randomization.paddle_restitution)
+    after = worlds.randomizer.state_dict()
+    assert after["ball.paddle_restitution"].min() >= low - 1e-6
+    assert after["ball.paddle_restitution"].max() <= min(high, 1.0) + 1e-6
+    for name, value in after.items():
+        assert torch.equal(value[~mask], before[name][~mask]), name
+        low, high = value.min(), value.max()
+        assert (high == low) or not torch.equal(value[mask], before[name][mask]), name
+
+
+def test_pushes_come_in_their_interval_and_size() -> None:
+    worlds = make_worlds(256, "randomization.push_velocity=[-0.2,0.2]", "randomization.push_interval=[1.0,2.0]")
+    steps, pushes, largest = 200, 0, 0.0
+    for _ in range(steps):
+        push = worlds.randomizer.update_push()
+        pushes += int((push.abs().sum(1) > 0).sum())
+        largest = max(largest, float(push.abs().max()))
+    rate = pushes / (256 * steps * worlds.control_dt)
+    assert rate == pytest.approx(1 / 1.5, rel=0.1)
+    assert 0.19 < largest <= 0.2
+
+
+def test_gravity_and_heading_of_a_turned_base() -> None:
+    worlds = make_worlds(2)
+    n = worlds.num_worlds
+    qpos = torch.zeros(n, 28)
+    qpos[:, 2] = 1.5
+    half = torch.tensor(0.25)
+    qpos[0, 3], qpos[0, 6] = torch.cos(half), torch.sin(half)  # yaw 0.5
+    qpos[1, 3], qpos[1, 5] = torch.cos(half), torch.sin(half)  # pitch 0.5
+    worlds.reset_robot(torch.ones(n, dtype=torch.bool), qpos, torch.zeros(n, 27))
+    cos, sin = torch.cos(torch.tensor(0.5)), torch.sin(torch.tensor(0.5))
+    torch.testing.assert_close(worlds.robot.heading, torch.tensor([[cos, sin], [1.0, 0.0]]))
+    expected = torch.tensor([[0.0, 0.0, -1.0], [sin, 0.0, -cos]])
+    torch.testing.assert_close(worlds.robot.projected_gravity, expected, atol=1e-6, rtol=0)
+
+
+def test_the_ball_pushes_the_paddle_back() -> None:
+    """A fast ball on a resting paddle: with the reaction the paddle moves with the ball, without it it does not."""
+    speeds = []
+    for reaction in ("true", "false"):
+        worlds = make_worlds(1, f"engine.paddle_reaction={reaction}")
+        stand(worlds)
+        target = worlds.nominal.repeat(1, 1)
+        normal = worlds.robot.paddle_normal.clone()
+        start = worlds.robot.paddle_position + 0.12 * normal
+        worlds.serve(torch.ones(1, dtype=torch.bool), start, -10.0 * normal, torch.zeros(1, 3))
+        worlds.step(target)
+        assert int(worlds.ball.events.paddle_hit) == 1
+        worlds.step(target)
+        speeds.append(float((worlds.robot.paddle_velocity * normal).sum()))
+    assert speeds[0] < speeds[1] - 0.02
+
+
+def test_state_dict_restores_the_next_step_exactly() -> None:
+    config = load_train_config(["engine=native"])
+    worlds = Worlds(config, 8, "cpu", torch.Generator().manual_seed(1))
+    stand(worlds)
+    targets = worlds.nominal + 0.1 * torch.randn(8, 21)
+    worlds.step(targets)
+    state = {name: value.clone() for name, value in worlds.state_dict().items()}
+    random_state = worlds.generator.get_state()
+    worlds.step(targets)
+    expected = worlds.engine.qpos_path[:, -1].clone()
+    other = Worlds(config, 8, "cpu", torch.Generator().manual_seed(2))
+    other.load_state_dict(state)
+    other.generator.set_state(random_state)
+    other.step(targets)
+    assert torch.equal(other.engine.qpos_path[:, -1], expected)
