@@ -1,0 +1,160 @@
+"""The MuJoCo model of robot, table and floor, with gains, limits and solver taken from the configuration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from pace.config import ConfigError, EngineConfig, RobotConfig, TableConfig
+
+SCENE = Path(__file__).parent / "assets" / "scene.xml"
+
+#: The 21 actuated joints, in the order of actions, of ``qpos[7:]`` and of ``qvel[6:]``.
+JOINT_NAMES = (
+    "Left_Shoulder_Pitch",
+    "Left_Shoulder_Roll",
+    "Left_Elbow_Pitch",
+    "Left_Elbow_Yaw",
+    "Right_Shoulder_Pitch",
+    "Right_Shoulder_Roll",
+    "Right_Elbow_Pitch",
+    "Right_Elbow_Yaw",
+    "Waist",
+    "Left_Hip_Pitch",
+    "Left_Hip_Roll",
+    "Left_Hip_Yaw",
+    "Left_Knee_Pitch",
+    "Left_Ankle_Pitch",
+    "Left_Ankle_Roll",
+    "Right_Hip_Pitch",
+    "Right_Hip_Roll",
+    "Right_Hip_Yaw",
+    "Right_Knee_Pitch",
+    "Right_Ankle_Pitch",
+    "Right_Ankle_Roll",
+)
+#: What can touch floor or table besides the feet; each is the name of its collision geom.
+CONTACT_BODIES = (
+    "trunk",
+    "head",
+    "left_upper_arm",
+    "right_upper_arm",
+    "left_forearm",
+    "right_forearm",
+    "paddle",
+    "left_thigh",
+    "right_thigh",
+    "left_shank",
+    "right_shank",
+)
+FEET = ("left_foot", "right_foot")
+TRUNK_BODY = "Trunk"
+#: Geoms whose friction rules every contact (they have priority over the robot's).
+STATIC_GEOMS = ("floor", "table")
+#: Name of the keyframe: nominal pose, soles on the floor.
+NOMINAL_KEY = "nominal"
+#: Group of the geoms that only the eye needs.
+VISUAL_GROUP = 2
+
+
+def nominal_pose(robot: RobotConfig) -> NDArray[np.float64]:
+    """Nominal joint positions (21,), rad, in the order of ``JOINT_NAMES``.
+
+    Errors: :class:`ConfigError` for a joint that the robot does not have.
+    """
+    unknown = sorted(set(robot.nominal_pose) - set(JOINT_NAMES))
+    if unknown:
+        raise ConfigError(f"robot.nominal_pose names no joint of the robot: {', '.join(unknown)}")
+    return np.array([robot.nominal_pose.get(name, 0.0) for name in JOINT_NAMES])
+
+
+def joint_gains(robot: RobotConfig) -> NDArray[np.float64]:
+    """Rows kp (N m/rad), kd (N m s/rad) and effort (N m) of every joint: (3, 21).
+
+    Errors: :class:`ConfigError` for a joint that no group of ``robot.joint_groups`` matches.
+    """
+    columns = []
+    for name in JOINT_NAMES:
+        group = next((g for g in robot.joint_groups if any(part in name for part in g.match)), None)
+        if group is None:
+            raise ConfigError(f"robot.joint_groups: no group matches joint {name}")
+        columns.append((group.kp, group.kd, group.effort))
+    return np.array(columns).T
+
+
+def build_model(robot: RobotConfig, engine: EngineConfig, table: TableConfig, visual: bool = False) -> mujoco.MjModel:
+    """Compile robot, table, floor and the mocap ball: nq 28, nv 27, nu 21.
+
+    Args:
+        robot: gains, efforts, armature and nominal pose.
+        engine: time step, solver iterations and cone.
+        table: size of table, net and paddle.
+        visual: keep the geoms that only the eye needs. The dynamics are the same with and without them;
+            physics leaves them out because each costs time in every step.
+
+    Errors: :class:`ConfigError` for gains or a pose that do not fit the robot's joints.
+    """
+    spec = mujoco.MjSpec.from_file(str(SCENE))
+    _set_motors(spec, robot)
+    _fit_table(spec, table)
+    spec.option.timestep = engine.physics_dt
+    spec.option.iterations = engine.solver_iterations
+    spec.option.ls_iterations = engine.line_search_iterations
+    spec.option.cone = getattr(mujoco.mjtCone, f"mjCONE_{engine.cone.upper()}")
+    if not visual:
+        for geom in [g for g in spec.geoms if g.group == VISUAL_GROUP]:
+            spec.delete(geom)
+    spec.add_key(name=NOMINAL_KEY)
+    model = spec.compile()
+    model.key(NOMINAL_KEY).qpos[:] = _standing(model, nominal_pose(robot))
+    return model
+
+
+def _set_motors(spec: mujoco.MjSpec, robot: RobotConfig) -> None:
+    for name, (kp, kd, effort) in zip(JOINT_NAMES, joint_gains(robot).T, strict=True):
+        spec.joint(name).armature = robot.armature
+        actuator = spec.actuator(name)
+        actuator.set_to_position(kp=kp, kv=kd)
+        actuator.forcerange = [-effort, effort]
+
+
+def _fit_table(spec: mujoco.MjSpec, table: TableConfig) -> None:
+    """Give table, lines, net and paddle the sizes of ``table``; the ball's physics uses the same numbers."""
+    length, width, top = table.length / 2, table.width / 2, table.height
+    net, post = table.net_height / 2, width + table.net_overhang
+    line, tape, leg = 0.01, 0.0075, (top - table.thickness) / 2  # m: half widths of lines and tape, half a leg
+    boxes = {
+        "table": ((length, width, table.thickness / 2), (0, 0, top - table.thickness / 2)),
+        "line_end_near": ((line, width, 0.0005), (line - length, 0, top)),
+        "line_end_far": ((line, width, 0.0005), (length - line, 0, top)),
+        "line_side_left": ((length, line, 0.0005), (0, width - line, top)),
+        "line_side_right": ((length, line, 0.0005), (0, line - width, top)),
+        "line_middle": ((length, 0.0015, 0.0005), (0, 0, top)),
+        "net": ((0.003, post, net - tape), (0, 0, top + net - tape)),
+        "net_tape": ((0.004, post, tape), (0, 0, top + 2 * net - tape)),
+        "post_left": ((0.01, net + 0.015, 0), (0, post + 0.01, top + net - 0.015)),
+        "post_right": ((0.01, net + 0.015, 0), (0, -post - 0.01, top + net - 0.015)),
+    }
+    for x in (-1, 1):
+        for y, side in ((1, "left"), (-1, "right")):
+            end = "near" if x < 0 else "far"
+            boxes[f"leg_{end}_{side}"] = ((0.025, 0.025, leg), (x * (length - 0.32), y * (width - 0.16), leg))
+    for name, (size, pos) in boxes.items():
+        spec.geom(name).size = size
+        spec.geom(name).pos = pos
+    spec.geom("paddle").size[:2] = (table.paddle_radius, table.paddle_half_thickness)
+    for name, side in (("paddle_front", 1), ("paddle_back", -1)):
+        spec.geom(name).size[:2] = (table.paddle_radius - 0.0005, 0.001)
+        spec.geom(name).pos[0] = side * (table.paddle_half_thickness - 0.0007)
+
+
+def _standing(model: mujoco.MjModel, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The state (28,) with joints at ``pose`` and the base at such a height that the lowest sole touches the floor."""
+    data = mujoco.MjData(model)
+    data.qpos[7:] = pose
+    mujoco.mj_kinematics(model, data)
+    data.qpos[2] -= min(data.site(name).xpos[2] for name in FEET)
+    return data.qpos.copy()
