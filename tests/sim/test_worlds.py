@@ -65,8 +65,9 @@ def test_pushes_come_in_their_interval_and_size() -> None:
         push = worlds.randomizer.update_push()
         pushes += int((push.abs().sum(1) > 0).sum())
         largest = max(largest, float(push.abs().max()))
-    rate = pushes / (256 * steps * worlds.control_dt)
-    assert rate == pytest.approx(1 / 1.5, rel=0.1)
+    # renewal process with intervals U(1, 2): E[N(t)] = t / mean + (variance - mean^2) / (2 mean^2)
+    expected = steps * worlds.control_dt / 1.5 + (1 / 12 - 1.5**2) / (2 * 1.5**2)
+    assert pushes / 256 == pytest.approx(expected, rel=0.1)
     assert 0.19 < largest <= 0.2
 
 
