@@ -3,7 +3,6 @@
 import warp as wp
 
 from pace.sim.flight import (
-    ALL_SURFACES,
     FLOOR,
     NET,
     NOTHING,
@@ -22,6 +21,7 @@ from pace.sim.flight import (
     paddle_centre,
     paddle_pose,
     paddle_speed_bound,
+    reachable_surfaces,
     read_body,
 )
 
@@ -223,13 +223,16 @@ def fly_step(
     flight.position = position[world]
     flight.velocity = velocity[world]
     flight.spin = spin[world]
-    flight.gaps = gaps_to(ALL_SURFACES, flight.position, 0.0, body.radius, scene, world)
     paddle_speed = paddle_speed_bound(scene, world)
+    # A rebound turns spin into speed.
+    speed = wp.length(flight.velocity) + body.radius * wp.length(flight.spin)
+    surfaces = reachable_surfaces(flight.position, speed, paddle_speed, control_dt, body.radius, scene, world)
+    flight.gaps = gaps_to(surfaces, flight.position, 0.0, body.radius, scene, world)
     centre = paddle_centre(scene, world, 0.0)
     distance = wp.length(flight.position - centre)
     for _leg in range(_MAX_LEGS):
         remaining = control_dt - flight.clock
-        flight, leg = fly_leg(flight, ALL_SURFACES, paddle_speed, remaining, ball_dt, body, scene, world)
+        flight, leg = fly_leg(flight, surfaces, paddle_speed, remaining, ball_dt, body, scene, world)
         next_centre = paddle_centre(scene, world, flight.clock)
         distance = wp.min(distance, _segment_distance(leg.arc.start - centre, leg.arc.end - next_centre))
         centre = next_centre

@@ -220,6 +220,18 @@ def paddle_speed_bound(scene: Scene, world: int) -> float:
 
 
 @wp.func
+def reachable_surfaces(
+    position: wp.vec3, speed: float, paddle_speed: float, duration: float, radius: float, scene: Scene, world: int
+) -> int:
+    """How many surfaces the ball can meet within ``duration`` s from the path's start on: a far paddle is left out."""
+    size = scene.paddle_radius + scene.paddle_half_thickness + radius
+    gap = wp.length(position - paddle_centre(scene, world, 0.0)) - size
+    if gap > (speed + GRAVITY * duration + paddle_speed) * duration:
+        return STATIC_SURFACES
+    return ALL_SURFACES
+
+
+@wp.func
 def gap_to(surface: int, position: wp.vec3, clock: float, radius: float, scene: Scene, world: int):
     """Gap (m, negative inside) between the ball and a surface, and the unit normal from the surface to the ball."""
     if surface == TABLE:
@@ -239,11 +251,13 @@ def gap_to(surface: int, position: wp.vec3, clock: float, radius: float, scene: 
 
 @wp.func
 def gaps_to(surfaces: int, position: wp.vec3, clock: float, radius: float, scene: Scene, world: int) -> wp.vec4:
-    """Gaps to the first ``surfaces`` surfaces; the others are far."""
-    gaps = wp.vec4(_FAR, _FAR, _FAR, _FAR)
-    for surface in range(surfaces):
-        gap, _normal = gap_to(surface, position, clock, radius, scene, world)
-        gaps[surface] = gap
+    """Gaps to the first ``surfaces`` surfaces; a paddle that is not among them is far."""
+    table, _table_normal = box_distance(position, scene.table_centre, scene.table_half)
+    net, _net_normal = box_distance(position, scene.net_centre, scene.net_half)
+    gaps = wp.vec4(table - radius, net - radius, position[2] - radius, _FAR)
+    if surfaces > PADDLE:
+        gap, _normal = gap_to(PADDLE, position, clock, radius, scene, world)
+        gaps[PADDLE] = gap
     return gaps
 
 
@@ -322,12 +336,9 @@ def touching_contact(surface: int, arc: Arc, radius: float, scene: Scene, world:
 
 @wp.func
 def contact_with(
-    surface: int, arc: Arc, gap: float, end_gap: float, speed: float, radius: float, scene: Scene, world: int
+    surface: int, arc: Arc, gap: float, end_gap: float, radius: float, scene: Scene, world: int
 ) -> Contact:
-    """The first contact with ``surface`` on an arc over which its gap goes from ``gap`` to ``end_gap`` (m).
-
-    ``speed`` bounds the relative speed (m/s), so that a grazing contact is looked for only where it can be.
-    """
+    """The first contact with ``surface`` on an arc over which its gap goes from ``gap`` to ``end_gap`` (m)."""
     contact = Contact()
     contact.surface = NOTHING
     if gap <= TOUCH:
@@ -337,7 +348,7 @@ def contact_with(
     time = wp.float32(_NEVER)
     if end_gap < 0.0:
         time = closing_time(surface, arc, arc.duration, radius, scene, world)
-    elif gap + end_gap < speed * arc.duration:
+    else:
         time = grazing_time(surface, arc, radius, scene, world)
     if time <= arc.duration:
         contact.surface = surface
@@ -346,8 +357,21 @@ def contact_with(
 
 
 @wp.func
+def may_touch(gap: float, end_gap: float, speed: float, duration: float) -> bool:
+    """Whether a gap can close within a sub-step at whose ends it is ``gap`` and ``end_gap`` (m)."""
+    return end_gap < 0.0 or gap + end_gap < speed * duration
+
+
+@wp.func
 def first_contact(
-    arc: Arc, gaps: wp.vec4, end_gaps: wp.vec4, speed: float, paddle_speed: float, body: Body, scene: Scene, world: int
+    arc: Arc,
+    gaps: wp.vec4,
+    end_gaps: wp.vec4,
+    speed: float,
+    paddle_speed: float,
+    radius: float,
+    scene: Scene,
+    world: int,
 ) -> Contact:
     """The earliest contact on an arc; ``speed`` bounds the ball's, ``paddle_speed`` the paddle's (m/s)."""
     first = Contact()
@@ -359,8 +383,8 @@ def first_contact(
             relative += paddle_speed
         gap = gaps[surface]
         end_gap = end_gaps[surface]
-        if end_gap < 0.0 or gap + end_gap < relative * arc.duration:
-            contact = contact_with(surface, arc, gap, end_gap, relative, body.radius, scene, world)
+        if may_touch(gap, end_gap, relative, arc.duration):
+            contact = contact_with(surface, arc, gap, end_gap, radius, scene, world)
             if contact.surface != NOTHING and contact.time < first.time:
                 first = contact
     return first
@@ -438,7 +462,13 @@ def fly_leg(
     arc.end = end
     arc.end_velocity = end_velocity
     end_gaps = gaps_to(surfaces, arc.end, arc.clock + arc.duration, body.radius, scene, world)
-    contact = first_contact(arc, flight.gaps, end_gaps, speed, paddle_speed, body, scene, world)
+    contact = Contact()
+    contact.surface = NOTHING
+    still = wp.min(flight.gaps[TABLE] + end_gaps[TABLE], flight.gaps[NET] + end_gaps[NET])
+    still = wp.min(still, flight.gaps[FLOOR] + end_gaps[FLOOR])
+    moving = flight.gaps[PADDLE] + end_gaps[PADDLE]
+    if still < speed * arc.duration or moving < (speed + paddle_speed) * arc.duration:
+        contact = first_contact(arc, flight.gaps, end_gaps, speed, paddle_speed, body.radius, scene, world)
     leg = Leg()
     leg.surface = contact.surface
     if contact.surface != NOTHING:

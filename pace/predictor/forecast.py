@@ -1,0 +1,57 @@
+"""The physics-based predictor as a plain function: where a flight bounces, peaks and lands."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import torch
+from omegaconf import OmegaConf
+from torch import Tensor
+
+from pace.config import TableConfig, config_dir
+from pace.sim.ball import DEFAULT_PRESET, BallParams, BallSim, Forecast, ball_preset
+
+
+@lru_cache
+def _ball_dt() -> float:
+    """s, the longest sub-step of a flight, as the engines' configurations have it."""
+    solver = OmegaConf.load(config_dir() / "engine" / "_solver.yaml")
+    return float(OmegaConf.select(solver, "ball_dt", throw_on_missing=True))
+
+
+def forecast_flight(
+    position: Tensor,
+    velocity: Tensor,
+    spin: Tensor | None = None,
+    params: BallParams | None = None,
+    table: TableConfig | None = None,
+    intercept_x: float = -1.6,
+) -> Forecast:
+    """Fly N balls ahead among table, net and floor, through any paddle, and say what they meet.
+
+    Args:
+        position: (N, 3) m, world frame (origin on the floor below the table's centre, x to the opponent, z up).
+        velocity: (N, 3) m/s.
+        spin: (N, 3) rad/s; ``None`` is no spin.
+        params: ball, air and contacts, numbers or tensors (N,); ``None`` is the preset of the default configuration.
+        table: table, net and floor; ``None`` takes those of the same preset.
+        intercept_x: m, where :attr:`Forecast.intercept` is asked for.
+
+    Returns:
+        :class:`pace.sim.ball.Forecast`: tensors (N, ...) on the device of ``position``, in m and s from now, NaN where
+        there is none. The flight is the simulation's own.
+
+    Errors: ``ValueError`` for another shape than (N, 3).
+    """
+    spin = torch.zeros_like(position) if spin is None else spin
+    for name, value in (("position", position), ("velocity", velocity), ("spin", spin)):
+        if value.dim() != 2 or value.shape != position.shape or value.shape[1] != 3:
+            raise ValueError(f"{name} must have shape (N, 3) with one N for all, not {tuple(value.shape)}")
+    preset = ball_preset(DEFAULT_PRESET)
+    count, device = position.shape[0], position.device
+    sim = BallSim(
+        count, device, params or BallParams.from_config(preset), table or preset.table, _ball_dt(), 1, _ball_dt()
+    )
+    everyone = torch.ones(count, dtype=torch.bool, device=device)
+    sim.forecast(everyone, position, velocity, spin, intercept_x)
+    return sim.forecast_result
