@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pace.config import ConfigError, EngineConfig
-from pace.sim.robot import FEET, STATIC_GEOMS, TRUNK_BODY
+from pace.sim.robot import FEET, TRUNK_BODY
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class EngineParams:
     Contact softness (``invweight0``) stays that of the nominal robot.
     """
 
-    friction: Tensor  # (N,) sliding friction of every contact with floor and table
+    friction: Tensor  # (N,) sliding friction of every contact
     trunk_mass: Tensor  # (N,) kg added to the trunk, its inertia growing in proportion
     trunk_com: Tensor  # (N, 3) m added to the trunk's centre of mass, trunk frame
     kp_scale: Tensor  # (N,) of all joints
@@ -32,7 +32,7 @@ class EngineParams:
     def nominal(cls, model: mujoco.MjModel, num_worlds: int, device: torch.device) -> EngineParams:
         """The parameters with which every world is ``model`` itself."""
         values = dict.fromkeys((f.name for f in fields(cls)), 1.0)
-        values |= {"friction": float(model.geom("floor").friction[0]), "trunk_mass": 0.0, "trunk_com": 0.0}
+        values |= {"friction": float(model.pair_friction[0, 0]), "trunk_mass": 0.0, "trunk_com": 0.0}
         shapes = {name: (num_worlds, 3) if name == "trunk_com" else (num_worlds,) for name in values}
         return cls(**{name: torch.full(shapes[name], value, device=device) for name, value in values.items()})
 
@@ -49,7 +49,7 @@ class ModelFields:
     """Which model fields follow the parameters, and how: both engines write what this class says."""
 
     NAMES = (
-        "geom_friction",
+        "pair_friction",
         "body_mass",
         "body_subtreemass",
         "body_inertia",
@@ -65,7 +65,6 @@ class ModelFields:
             return torch.tensor(values, dtype=torch.float32, device=device)
 
         self._trunk = int(model.body(TRUNK_BODY).id)
-        self._geoms = [int(model.geom(name).id) for name in STATIC_GEOMS]
         self._mass = float(model.body_mass[self._trunk])
         self._subtree_mass = {body: float(model.body_subtreemass[body]) for body in (0, self._trunk)}
         self._inertia = constant(model.body_inertia[self._trunk])
@@ -81,7 +80,7 @@ class ModelFields:
         growth = (1.0 + mass / self._mass).unsqueeze(-1)
         kp, kd = params.kp_scale.unsqueeze(-1) * self._kp, params.kd_scale.unsqueeze(-1) * self._kd
         return [
-            *(("geom_friction", (geom, 0), params.friction) for geom in self._geoms),
+            ("pair_friction", (everything, slice(2)), params.friction.view(-1, 1, 1)),  # both directions
             ("body_mass", (trunk,), mass + self._mass),
             *(("body_subtreemass", (body,), mass + nominal) for body, nominal in self._subtree_mass.items()),
             ("body_inertia", (trunk,), growth * self._inertia),

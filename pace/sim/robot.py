@@ -36,7 +36,7 @@ JOINT_NAMES = (
     "Right_Ankle_Pitch",
     "Right_Ankle_Roll",
 )
-#: What can touch floor or table besides the feet; each is the name of its collision geom.
+#: What can touch floor, table or paddle besides the feet; each is the name of its collision geom.
 CONTACT_BODIES = (
     "trunk",
     "head",
@@ -52,8 +52,6 @@ CONTACT_BODIES = (
 )
 FEET = ("left_foot", "right_foot")
 TRUNK_BODY = "Trunk"
-#: Geoms whose friction rules every contact (they have priority over the robot's).
-STATIC_GEOMS = ("floor", "table")
 #: Name of the keyframe: nominal pose, soles on the floor.
 NOMINAL_KEY = "nominal"
 #: Group of the geoms that only the eye needs.

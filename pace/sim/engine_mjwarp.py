@@ -1,0 +1,142 @@
+"""The MuJoCo Warp engine: thousands of worlds on a GPU, and the same code on Warp's CPU device for tests."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import mujoco_warp as mjw
+import torch
+import warp as wp
+from torch import Tensor
+
+from pace.config import EngineConfig
+from pace.sim.engine import ModelFields, StateTensors
+
+#: Overflows that drop contacts or constraints. The solver's iteration limits, which share the bit mask, do not.
+_DROPPED = (
+    mjw.OverflowType.NEFC
+    | mjw.OverflowType.NJMAX_NNZ
+    | mjw.OverflowType.BROADPHASE
+    | mjw.OverflowType.NARROWPHASE
+    | mjw.OverflowType.CCD
+    | mjw.OverflowType.CONTACT_MATCH
+)
+
+
+@wp.kernel
+def _load_targets(targets: wp.array3d[float], step: int, ctrl: wp.array2d[float]):
+    world, joint = wp.tid()
+    ctrl[world, joint] = targets[world, step, joint]
+
+
+@wp.kernel
+def _record_state(
+    qpos: wp.array2d[float],
+    qvel: wp.array2d[float],
+    instant: int,
+    qpos_path: wp.array3d[float],
+    qvel_path: wp.array3d[float],
+):
+    world = wp.tid()
+    for i in range(qpos.shape[1]):
+        qpos_path[world, instant, i] = qpos[world, i]
+    for i in range(qvel.shape[1]):
+        qvel_path[world, instant, i] = qvel[world, i]
+
+
+class MjwarpEngine(StateTensors):
+    """MuJoCo Warp in float32. See :class:`~pace.sim.engine.RobotEngine`.
+
+    On a GPU one control step is one CUDA graph, captured at the first ``advance``. The graph holds the addresses of
+    the arrays and the options of that moment: values are edited in place without a new capture; after replacing an
+    array of ``model`` or ``data``, or an option of ``model.opt``, set ``graph`` to None and the next step captures anew.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, engine: EngineConfig, num_worlds: int, device: torch.device, substeps: int
+    ) -> None:
+        super().__init__(model, num_worlds, device, substeps, engine.physics_dt)
+        self._warp_device = wp.device_from_torch(device)
+        self._fields = ModelFields(model, device)
+        with wp.ScopedDevice(self._warp_device):
+            self.model = mjw.put_model(model)
+            self.model.opt.warn_overflow = 0  # a line a world a step; overflowed() tells
+            self.data = mjw.make_data(
+                model, num_worlds, nconmax=engine.contacts_per_world, njmax=engine.constraints_per_world
+            )
+        self._model = {name: self._expand(getattr(model, name), name) for name in ModelFields.NAMES}
+        data = self.data
+        self._qpos, self._qvel = wp.to_torch(data.qpos), wp.to_torch(data.qvel)
+        self._warmstart, self._applied = wp.to_torch(data.qacc_warmstart), wp.to_torch(data.qfrc_applied)
+        self._sensordata, self._actuator_force = wp.to_torch(data.sensordata), wp.to_torch(data.actuator_force)
+        self._overflow = wp.to_torch(data.overflow)
+        self._targets = torch.zeros(num_worlds, substeps, model.nu, device=device)
+        self._warp_targets = wp.from_torch(self._targets)
+        self._warp_path = [wp.from_torch(self.qpos_path), wp.from_torch(self.qvel_path)]
+        self.graph: Any = None
+        self._qpos.copy_(self.qpos_path[:, 0])
+
+    def _expand(self, nominal: Any, name: str) -> Tensor:
+        """Give a model field a leading world dimension; return it as a tensor that shares its memory."""
+        values = torch.as_tensor(nominal, dtype=torch.float32, device=self.device)
+        values = values.unsqueeze(0).repeat(self.num_worlds, *[1] * values.dim())
+        setattr(self.model, name, wp.from_torch(values, dtype=getattr(self.model, name).dtype))
+        return values
+
+    def advance(self, targets: Tensor, applied: Tensor) -> None:
+        self._targets.copy_(targets)
+        self._applied.copy_(applied)
+        if self._warp_device.is_cuda:
+            if self.graph is None:
+                self._capture()
+            wp.capture_launch(self.graph)
+        else:
+            self._play()
+        self._read_sensors(self._sensordata, self._actuator_force)
+
+    def _capture(self) -> None:
+        with wp.ScopedDevice(self._warp_device), wp.ScopedCapture() as capture:
+            self._play()
+        self.graph = capture.graph
+
+    def _play(self) -> None:
+        """The launches of one control step."""
+        self._record(0)
+        with wp.ScopedDevice(self._warp_device):
+            for step in range(self.substeps):
+                wp.launch(_load_targets, dim=self.data.ctrl.shape, inputs=[self._warp_targets, step, self.data.ctrl])
+                mjw.step(self.model, self.data)
+                self._record(step + 1)
+
+    def _record(self, instant: int) -> None:
+        inputs = [self.data.qpos, self.data.qvel, instant, *self._warp_path]
+        wp.launch(_record_state, dim=self.num_worlds, inputs=inputs, device=self._warp_device)
+
+    def reset(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
+        wide = mask.unsqueeze(-1)
+        for state, path, values in ((self._qpos, self.qpos_path, qpos), (self._qvel, self.qvel_path, qvel)):
+            state.copy_(torch.where(wide, values, state))
+            path.copy_(torch.where(wide.unsqueeze(-1), values.unsqueeze(1), path))
+        for tensor in (self._warmstart, self.body_contact, self.joint_torque):
+            tensor.masked_fill_(wide, 0.0)
+        self.foot_force.masked_fill_(wide.unsqueeze(-1), 0.0)
+
+    def apply_params(self, mask: Tensor) -> None:
+        for name, index, values in self._fields.writes(self.params):
+            target = self._model[name][:, *index]
+            target.copy_(torch.where(mask.view(-1, *[1] * (target.dim() - 1)), values, target))
+
+    def add_velocity(self, delta: Tensor) -> None:
+        self._qvel += delta
+
+    def overflowed(self) -> bool:
+        return bool((self._overflow & int(_DROPPED)).any())
+
+    def state_dict(self) -> dict[str, Tensor]:
+        state = {"qpos": self._qpos, "qvel": self._qvel, "warmstart": self._warmstart}
+        return state | self._outputs()
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        for name, tensor in self.state_dict().items():
+            tensor.copy_(state[name])
