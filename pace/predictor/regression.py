@@ -1,0 +1,110 @@
+"""Online regression of the predictor on the rollout that was just played, and its error before it saw that rollout."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from pace.config import PredictorConfig
+from pace.predictor.network import PredictorNetwork
+
+TIME_BINS = (0.1, 0.2, 0.3, 0.4)  # s before the apex; the last bin is open
+BIN_NAMES = ("0_0.1s", "0.1_0.2s", "0.2_0.3s", "0.3_0.4s", "over_0.4s")
+
+
+class PredictorSource(Protocol):
+    """What the regression reads from the environment at each control step."""
+
+    predictor_input: Tensor  # (N, 3 frames) sensed ball positions, m, oldest first
+    predictor_target: Tensor  # (N, out) simulated truth
+    predictor_valid: Tensor  # (N,) bool: the target exists and the ball is on its way to it
+    predictor_time_to_apex: Tensor  # (N,) s
+
+
+class PredictorTrainer:
+    """Adam on a :class:`PredictorNetwork`, which it changes in place, over samples of the last (steps, N) rollout.
+
+    After ``config.train_updates`` updates the network is frozen (0: never); errors are measured all the same.
+    """
+
+    def __init__(self, network: PredictorNetwork, config: PredictorConfig, steps: int, num_worlds: int) -> None:
+        device = next(network.parameters()).device
+        self.network, self.config, self.steps = network, config, steps
+        self.updates = 0
+        self.optimiser = torch.optim.Adam(network.parameters(), lr=config.learning_rate)
+        self.inputs = torch.zeros(steps, num_worlds, network.input_size, device=device)
+        self.targets = torch.zeros(steps, num_worlds, network.output_size, device=device)
+        self.valid = torch.zeros(steps, num_worlds, dtype=torch.bool, device=device)
+        self.time_to_apex = torch.zeros(steps, num_worlds, device=device)
+        self._edges = torch.tensor(TIME_BINS, device=device)
+
+    @property
+    def frozen(self) -> bool:
+        """The network no longer changes."""
+        return not self.config.enabled or 0 < self.config.train_updates <= self.updates
+
+    @torch.no_grad()
+    def record(self, t: int, source: PredictorSource) -> None:
+        """Store the current step of all worlds in row ``t``."""
+        self.inputs[t].copy_(source.predictor_input)
+        self.valid[t].copy_(source.predictor_valid)
+        self.targets[t].copy_(torch.where(source.predictor_valid[:, None], source.predictor_target, 0.0))
+        self.time_to_apex[t].copy_(source.predictor_time_to_apex)
+
+    def update(self) -> dict[str, float]:
+        """Measure the error on the recorded samples, then fit them; returns the metrics of :meth:`errors`."""
+        metrics = self.errors()
+        if not self.frozen:
+            self._fit()
+            self.updates += 1
+        return metrics
+
+    @torch.no_grad()
+    def errors(self) -> dict[str, float]:
+        """RMSE of the apex (3-D, cm): ``predictor_rmse_cm``, and ``predictor_rmse_cm/<bin>`` by time before the apex.
+
+        A bin without a sample, and everything when the predictor is switched off, is NaN.
+        """
+        names = ["predictor_rmse_cm", *(f"predictor_rmse_cm/{name}" for name in BIN_NAMES)]
+        if not self.config.enabled:
+            return dict.fromkeys(names, math.nan)
+        predicted = self.network(self.inputs.flatten(0, 1))
+        columns = self.network.slices["apex"]
+        squared = (predicted - self.targets.flatten(0, 1))[:, columns].square().sum(1)
+        weight = self.valid.flatten().to(squared.dtype)
+        bins = torch.bucketize(self.time_to_apex.flatten(), self._edges, right=True)
+        sums = torch.zeros(2, len(BIN_NAMES), device=squared.device)
+        sums[0].index_add_(0, bins, squared * weight)
+        sums[1].index_add_(0, bins, weight)
+        totals = torch.cat([sums.sum(1, keepdim=True), sums], dim=1)
+        return dict(zip(names, (100.0 * (totals[0] / totals[1]).sqrt()).tolist(), strict=True))
+
+    def _fit(self) -> None:
+        """``batches_per_update`` steps of Adam on valid samples, drawn with replacement and without a host sync."""
+        inputs, targets = self.inputs.flatten(0, 1), self.targets.flatten(0, 1)
+        valid = self.valid.flatten()
+        by_validity = torch.argsort(valid, descending=True, stable=True)
+        count = valid.sum()
+        for _ in range(self.config.batches_per_update):
+            draw = torch.rand(self.config.batch_size, device=valid.device)
+            index = by_validity[(draw * count).long()]
+            error = self.network.scaled(inputs[index]) - self.network.scale_target(targets[index])
+            loss = (error.square().mean(1) * valid[index]).mean()  # zero where the rollout had no valid sample at all
+            self.optimiser.zero_grad(set_to_none=True)
+            loss.backward()
+            self.optimiser.step()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Adam's moments and the count of updates; the network's weights are kept with the policy's."""
+        moments = {str(i): entry for i, entry in self.optimiser.state_dict()["state"].items()}
+        return {"updates": self.updates, "moments": moments}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` gave."""
+        self.updates = int(state["updates"])
+        whole = self.optimiser.state_dict()
+        whole["state"] = {int(index): entry for index, entry in state["moments"].items()}
+        self.optimiser.load_state_dict(whole)

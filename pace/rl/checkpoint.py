@@ -1,0 +1,204 @@
+"""Checkpoints: a folder of safetensors and JSON, so that loading one runs no code.
+
+``checkpoint.json`` holds the format number, the configuration, the counters and the shape of every tensor's place;
+``weights.safetensors`` the networks and normalisers; ``training.safetensors`` the rest that an exact resume needs
+(optimisers, random states, the worlds). A folder is written under a temporary name and renamed when complete.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+FORMAT = 1
+META, WEIGHTS, TRAINING = "checkpoint.json", "weights.safetensors", "training.safetensors"
+FOLDER = "checkpoints"
+TENSOR_MARK = "__tensor__"
+
+
+class CheckpointError(RuntimeError):
+    """A checkpoint that cannot be found, read or used; the message names the file and the reason."""
+
+
+@dataclass
+class Checkpoint:
+    """One checkpoint in memory: ``weights`` by part (agent, predictor); no ``training`` when only weights are kept."""
+
+    config: dict[str, Any]
+    counters: dict[str, float]
+    weights: dict[str, dict[str, Tensor]]
+    training: dict[str, Any] | None
+    path: Path | None = None
+
+
+def flatten_tensors(value: Any, name: str, tensors: dict[str, Tensor]) -> Any:
+    """A JSON copy of nested dictionaries and lists in which every tensor is a reference into ``tensors``."""
+    if isinstance(value, Tensor):
+        tensors[name] = value.detach().cpu().contiguous().clone()
+        return {TENSOR_MARK: name}
+    if isinstance(value, Mapping):
+        for key in value:
+            if not isinstance(key, str):
+                raise TypeError(f"state {name or 'root'} has the key {key!r}; only strings can be saved")
+        return {key: flatten_tensors(item, f"{name}.{key}" if name else key, tensors) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [flatten_tensors(item, f"{name}.{index}", tensors) for index, item in enumerate(value)]
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise TypeError(f"state {name} is a {type(value).__name__}, which a checkpoint cannot hold")
+
+
+def restore_tensors(value: Any, tensors: Mapping[str, Tensor], source: Path) -> Any:
+    """Inverse of :func:`flatten_tensors` (tuples come back as lists)."""
+    if isinstance(value, dict):
+        if TENSOR_MARK in value:
+            if value[TENSOR_MARK] not in tensors:
+                raise CheckpointError(f"{source}: the tensor {value[TENSOR_MARK]} is missing")
+            return tensors[value[TENSOR_MARK]]
+        return {key: restore_tensors(item, tensors, source) for key, item in value.items()}
+    if isinstance(value, list):
+        return [restore_tensors(item, tensors, source) for item in value]
+    return value
+
+
+def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> Path:
+    """Write ``checkpoint`` as ``folder``, whole or not at all; an existing folder of that name is replaced."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir()
+    weights: dict[str, Tensor] = {}
+    meta: dict[str, Any] = {
+        "format": FORMAT,
+        "counters": checkpoint.counters,
+        "weights": flatten_tensors(checkpoint.weights, "", weights),
+        "training": None,
+        "config": checkpoint.config,
+    }
+    if checkpoint.training is not None:
+        training: dict[str, Tensor] = {}
+        meta["training"] = flatten_tensors(checkpoint.training, "", training)
+        save_file(training, temporary / TRAINING)
+    save_file(weights, temporary / WEIGHTS)
+    (temporary / META).write_text(json.dumps(meta, indent=1))
+    _sync(temporary)
+    if folder.exists():
+        shutil.rmtree(folder)
+    temporary.rename(folder)
+    return folder
+
+
+def _sync(folder: Path) -> None:
+    """Have the files on the disk before the rename makes them the newest checkpoint."""
+    for file in folder.iterdir():
+        with file.open("rb") as handle:
+            os.fsync(handle.fileno())
+
+
+def find_checkpoint(path: str | Path) -> Path:
+    """Folder of the checkpoint that ``path`` means: a run folder (its newest), a checkpoint folder, or a file in one.
+
+    Errors: :class:`CheckpointError` when there is none.
+    """
+    path = Path(path)
+    if path.is_file():
+        path = path.parent
+    if not path.exists():
+        raise CheckpointError(f"{path} does not exist: give a run folder or a checkpoint")
+    if (path / META).is_file():
+        return path
+    if (path / FOLDER).is_dir():
+        found = list_checkpoints(path)
+        if found:
+            return found[-1]
+        raise CheckpointError(f"{path} is a run folder without a checkpoint")
+    raise CheckpointError(f"{path} is neither a run folder nor a checkpoint: it has no {FOLDER}/ and no {META}")
+
+
+def list_checkpoints(run_dir: Path) -> list[Path]:
+    """Complete checkpoints of a run, oldest first."""
+    return sorted(folder for folder in (run_dir / FOLDER).glob("update_*") if (folder / META).is_file())
+
+
+def load_checkpoint(path: str | Path, weights_only: bool = False) -> Checkpoint:
+    """Read the checkpoint that ``path`` means (see :func:`find_checkpoint`), onto the CPU.
+
+    Errors: :class:`CheckpointError` for a missing or truncated file, another format number or a missing tensor.
+    """
+    folder = find_checkpoint(path)
+    meta = _read_meta(folder / META)
+    weights = restore_tensors(meta["weights"], _read_tensors(folder / WEIGHTS), folder / WEIGHTS)
+    training = None
+    if meta["training"] is not None and not weights_only:
+        training = restore_tensors(meta["training"], _read_tensors(folder / TRAINING), folder / TRAINING)
+    return Checkpoint(meta["config"], meta["counters"], weights, training, folder)
+
+
+def _read_meta(file: Path) -> dict[str, Any]:
+    try:
+        meta = json.loads(file.read_text())
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise CheckpointError(f"{file} cannot be read: {error}") from error
+    if not isinstance(meta, dict) or "format" not in meta:
+        raise CheckpointError(f"{file} is not a checkpoint: it has no format number")
+    if meta["format"] != FORMAT:
+        raise CheckpointError(f"{file} has format {meta['format']}, this version of pace reads format {FORMAT}")
+    missing = [key for key in ("config", "counters", "weights", "training") if key not in meta]
+    if missing:
+        raise CheckpointError(f"{file} lacks {', '.join(missing)}")
+    return meta
+
+
+def _read_tensors(file: Path) -> dict[str, Tensor]:
+    if not file.is_file():
+        raise CheckpointError(f"{file} is missing")
+    try:
+        return load_file(file)
+    except (SafetensorError, OSError) as error:
+        raise CheckpointError(f"{file} is broken: {error}") from error
+
+
+def load_weights(module: nn.Module, weights: Mapping[str, Tensor], source: str) -> None:
+    """Load a module's ``state_dict`` strictly.
+
+    Errors: :class:`CheckpointError` that names the first missing, reshaped or unknown tensor.
+    """
+    own = module.state_dict()
+    for name, tensor in own.items():
+        if name not in weights:
+            raise CheckpointError(f"{source}: the tensor {name} is missing")
+        if weights[name].shape != tensor.shape:
+            shapes = f"{tuple(weights[name].shape)}, this configuration needs {tuple(tensor.shape)}"
+            raise CheckpointError(f"{source}: the tensor {name} has the shape {shapes}")
+    unknown = [name for name in weights if name not in own]
+    if unknown:
+        raise CheckpointError(f"{source}: the tensor {unknown[0]} is not of this network")
+    module.load_state_dict(dict(weights))
+
+
+def prune_checkpoints(run_dir: Path, keep: int) -> None:
+    """Delete all but the newest ``keep`` checkpoints of a run."""
+    for folder in list_checkpoints(run_dir)[:-keep]:
+        shutil.rmtree(folder)
+
+
+def export_weights(path: str | Path, folder: str | Path) -> Path:
+    """Copy a checkpoint's weights and configuration without its training state, for ``pretrained/``."""
+    checkpoint = load_checkpoint(path, weights_only=True)
+    slim = {part: {k: _single(v) for k, v in tensors.items()} for part, tensors in checkpoint.weights.items()}
+    return save_checkpoint(Path(folder), Checkpoint(checkpoint.config, checkpoint.counters, slim, None))
+
+
+def _single(tensor: Tensor) -> Tensor:
+    """Float32 of a float64 tensor; others as they are."""
+    return tensor.float() if tensor.dtype == torch.float64 else tensor

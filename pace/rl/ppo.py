@@ -1,0 +1,174 @@
+"""The PPO update: TorchRL's ClipPPOLoss and KL-adaptive learning rate, over minibatches gathered into fixed buffers."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+from torchrl.objectives import ClipPPOLoss, KLAdaptiveLR
+
+from pace.config import AlgoConfig, ConfigError
+from pace.rl.policy import Agent, scheduled
+from pace.rl.rollout import Rollout, RolloutError
+
+LOSS_METRICS = (
+    "loss_objective",
+    "loss_critic",
+    "entropy",
+    "clip_fraction",
+    "value_clip_fraction",
+    "explained_variance",
+)
+METRICS = ("kl", "grad_norm_actor", "grad_norm_critic", *LOSS_METRICS)
+
+
+class PPOLoss(ClipPPOLoss):
+    """ClipPPOLoss that also reports the exact mean KL divergence between the two Gaussians.
+
+    The loss's own ``kl_approx`` is a mean of log-ratios: its noise over a small minibatch is a good part of the KL
+    target, and it can be negative, which the learning-rate schedule ignores.
+    """
+
+    kl: Tensor
+
+    def _get_cur_log_prob(self, tensordict: TensorDictBase, params: Any = None) -> tuple[Tensor, Any, bool]:
+        log_prob, dist, composite = super()._get_cur_log_prob(tensordict, params)
+        with torch.no_grad():
+            ratio = tensordict["old_scale"].square() / dist.variance
+            shift = (tensordict["old_loc"] - dist.mean).square() / dist.variance
+            self.kl = 0.5 * (shift + ratio - ratio.log() - 1.0).sum(-1).mean()
+        return log_prob, dist, composite
+
+
+class PPO:
+    """Learner of an :class:`Agent`: one optimiser, gradient bound and parameter set each for actor and critic."""
+
+    def __init__(self, agent: Agent, config: AlgoConfig) -> None:
+        self.agent, self.config = agent, config
+        self.loss = PPOLoss(
+            agent.actor_operator(),
+            agent.critic_operator(),
+            clip_epsilon=config.clip,
+            entropy_coeff=config.entropy[0].value,
+            critic_coeff=config.value_coefficient,
+            loss_critic_type="l2",
+            clip_value=config.clip if config.clip_value else None,
+            functional=False,
+        )
+        self.actor_parameters = list(agent.actor.parameters())
+        self.critic_parameters = list(agent.critic.parameters())
+        self.actor_optimiser = torch.optim.Adam(self.actor_parameters, lr=config.learning_rate, fused=True)
+        self.critic_optimiser = torch.optim.Adam(self.critic_parameters, lr=config.learning_rate, fused=True)
+        self.schedule = KLAdaptiveLR(
+            self.actor_optimiser,
+            config.kl_target,
+            min_lr=config.learning_rate_min,
+            max_lr=config.learning_rate_max,
+        )
+        self._minibatch: TensorDict | None = None
+
+    def update(self, rollout: Rollout, samples: float) -> dict[str, float]:
+        """Learn from one rollout, ``samples`` control steps into the run; returns the means of the update's metrics.
+
+        Errors: :class:`RolloutError` when a loss is not finite; the weights are then not to be saved.
+        """
+        self.loss.get_buffer("entropy_coeff").fill_(scheduled(self.config.entropy, samples))
+        sources, batch = self._sources(rollout), self._buffers(rollout)
+        rows = batch.batch_size[0]
+        totals: list[Tensor] = []
+        for _ in range(self.config.epochs):
+            order = torch.randperm(rollout.steps * rollout.num_worlds, device=rollout.reward.device)
+            for index in order[: rows * self.config.minibatches].split(rows):
+                for name, source in sources.items():
+                    torch.index_select(source, 0, index, out=batch[name])
+                totals.append(self._learn(batch))
+        self.agent.actor.bound_std(self.config.std_floor, scheduled(self.config.std, samples))
+        mean = torch.stack(totals).mean(0).tolist()
+        metrics: dict[str, float] = dict(zip(METRICS, mean, strict=True))
+        self._require_finite(metrics)
+        metrics["lr"] = self.schedule.get_last_lr()[0]
+        metrics["policy_std"] = self.agent.actor.std.mean().item()
+        return metrics
+
+    def _learn(self, batch: TensorDict) -> Tensor:
+        """One optimiser step of each network; returns its METRICS as one tensor."""
+        self.actor_optimiser.zero_grad(set_to_none=True)
+        self.critic_optimiser.zero_grad(set_to_none=True)
+        out = self.loss(batch)
+        kl = self.loss.kl.item()
+        if not math.isfinite(kl):
+            raise RolloutError("not finite: the policy's output in the PPO update (its KL divergence)")
+        self.schedule.step(kl)
+        (out["loss_objective"] + out["loss_critic"] + out["loss_entropy"]).backward()
+        actor_norm = nn.utils.clip_grad_norm_(self.actor_parameters, self.config.max_grad_norm)
+        critic_norm = nn.utils.clip_grad_norm_(self.critic_parameters, self.config.max_grad_norm)
+        self.actor_optimiser.step()
+        self.critic_optimiser.step()
+        values = [out.get(name, torch.zeros(())) for name in LOSS_METRICS]
+        return torch.stack([v.detach().reshape(()) for v in (self.loss.kl, actor_norm, critic_norm, *values)])
+
+    def _sources(self, rollout: Rollout) -> dict[str, Tensor]:
+        """Flat (steps * N, ...) views of the rollout by the loss's names; advantages standardised over all samples."""
+        steps = rollout.steps
+        advantage = rollout.advantage.view(-1, 1)
+        deviation, mean = torch.std_mean(advantage)
+        return {
+            "policy": rollout.policy.flatten(0, 1),
+            "critic": rollout.critic[:steps].flatten(0, 1),
+            "action": rollout.action.flatten(0, 1),
+            "old_loc": rollout.loc.flatten(0, 1),
+            "action_log_prob": rollout.log_prob.view(-1),
+            "advantage": (advantage - mean) / (deviation + 1e-8),
+            "value_target": rollout.value_target.view(-1, 1),
+            "state_value": rollout.value[:steps].view(-1, 1),
+        }
+
+    def _buffers(self, rollout: Rollout) -> TensorDict:
+        """The minibatch that all gathers write into; allocated at the first update."""
+        if self._minibatch is None:
+            rows = rollout.steps * rollout.num_worlds // self.config.minibatches
+            if rows < 1:
+                raise ConfigError(
+                    f"algo.minibatches {self.config.minibatches} is more than the samples of an update, "
+                    f"num_worlds x algo.steps = {rollout.steps * rollout.num_worlds}"
+                )
+            sources = self._sources(rollout)
+            buffers = {name: torch.empty_like(source[:rows]) for name, source in sources.items()}
+            self._minibatch = TensorDict(buffers, batch_size=[rows])
+            self._minibatch["old_scale"] = rollout.scale.expand(rows, -1)
+        return self._minibatch
+
+    def _require_finite(self, metrics: dict[str, float]) -> None:
+        for name, value in metrics.items():
+            if not math.isfinite(value):
+                raise RolloutError(f"not finite: {name} of the PPO update")
+
+    def state_dict(self) -> dict[str, Any]:
+        """Both optimisers' moments and the adapted learning rates."""
+        return {
+            "actor_optimiser": optimiser_state(self.actor_optimiser),
+            "critic_optimiser": optimiser_state(self.critic_optimiser),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` gave."""
+        load_optimiser_state(self.actor_optimiser, state["actor_optimiser"])
+        load_optimiser_state(self.critic_optimiser, state["critic_optimiser"])
+
+
+def optimiser_state(optimiser: torch.optim.Optimizer) -> dict[str, Any]:
+    """Adam's state with string keys only, ready for a checkpoint."""
+    state = optimiser.state_dict()
+    moments = {str(index): entry for index, entry in state["state"].items()}
+    return {"lr": state["param_groups"][0]["lr"], "moments": moments}
+
+
+def load_optimiser_state(optimiser: torch.optim.Optimizer, saved: dict[str, Any]) -> None:
+    """Inverse of :func:`optimiser_state`, for an optimiser over the same parameters."""
+    state = optimiser.state_dict()
+    state["state"] = {int(index): entry for index, entry in saved["moments"].items()}
+    state["param_groups"][0]["lr"] = saved["lr"]
+    optimiser.load_state_dict(state)

@@ -1,0 +1,81 @@
+"""What a training run shows while it runs: a bar on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections import deque
+
+from tqdm import tqdm
+
+SECONDS_PER_LINE = 15.0
+WINDOW = 25  # updates over which the shown rates are taken
+
+
+def clock(seconds: float) -> str:
+    """``h:mm:ss`` or ``mm:ss``."""
+    whole = max(0, round(seconds))
+    hours, rest = divmod(whole, 3600)
+    return f"{hours}:{rest // 60:02d}:{rest % 60:02d}" if hours else f"{rest // 60:02d}:{rest % 60:02d}"
+
+
+class Progress:
+    """Progress towards the end of a run. ``samples`` is the limit in control steps, ``seconds`` that of the clock."""
+
+    def __init__(self, enabled: bool, samples: float, seconds: float, first_samples: float = 0.0) -> None:
+        self.samples, self.seconds, self.first_samples = samples, seconds, first_samples
+        self.recent: deque[dict[str, float]] = deque(maxlen=WINDOW)
+        self.started = time.monotonic()
+        self._last_line = -math.inf
+        self._enabled = enabled
+        self._bar: tqdm | None = None
+        if enabled and sys.stderr.isatty():
+            self._bar = tqdm(total=1.0, bar_format="{percentage:3.0f}%|{bar:16}| {desc}", dynamic_ncols=True)
+
+    def show(self, row: dict[str, float]) -> None:
+        """Take in the row of one update and show the state of the run."""
+        self.recent.append(row)
+        if not self._enabled:
+            return
+        fraction, left = self._remaining(row["samples"])
+        text = self._describe(row, left)
+        if self._bar is not None:
+            self._bar.n = fraction
+            self._bar.set_description_str(text)
+        elif time.monotonic() - self._last_line >= SECONDS_PER_LINE:
+            self._last_line = time.monotonic()
+            print(f"{100 * fraction:3.0f} % | {text}", flush=True)
+
+    def _remaining(self, samples: float) -> tuple[float, float]:
+        """Share of the run that is done, and seconds that are left, by whichever limit comes first."""
+        elapsed = time.monotonic() - self.started
+        speed = (samples - self.first_samples) / max(elapsed, 1e-9)
+        left = (self.samples - samples) / max(speed, 1e-9)
+        if self.seconds > 0:
+            left = min(left, self.seconds - elapsed)
+        left = max(left, 0.0)
+        return elapsed / max(elapsed + left, 1e-9), left
+
+    def _describe(self, row: dict[str, float], left: float) -> str:
+        parts = [
+            f"update {row['update']:.0f}",
+            f"{row['samples'] / 1e6:.2f} M samples",
+            f"{self.mean('samples_per_s'):,.0f}/s",
+            f"{clock(left)} left",
+            f"hit {100 * self.mean('hit_rate'):.1f} %",
+            f"return {100 * self.mean('success_rate'):.1f} %",
+            f"falls {self.mean('fall_rate'):.3f}/s",
+            f"predictor {self.mean('predictor_rmse_cm'):.1f} cm",
+        ]
+        return " | ".join(parts)
+
+    def mean(self, name: str) -> float:
+        """Mean of a column over the last updates, NaN left out; NaN if nothing is there."""
+        values = [row[name] for row in self.recent if not math.isnan(row[name])]
+        return sum(values) / len(values) if values else math.nan
+
+    def close(self) -> None:
+        """Leave the terminal in order."""
+        if self._bar is not None:
+            self._bar.close()

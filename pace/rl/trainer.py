@@ -1,0 +1,266 @@
+"""The training loop: play, check, fit the predictor, update the policy, log, save."""
+
+from __future__ import annotations
+
+import math
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from pace.config import ConfigError, TrainConfig, to_dict
+from pace.predictor.network import PredictorNetwork
+from pace.predictor.regression import PredictorSource, PredictorTrainer
+from pace.rl.checkpoint import (
+    FOLDER,
+    Checkpoint,
+    CheckpointError,
+    list_checkpoints,
+    load_weights,
+    prune_checkpoints,
+    save_checkpoint,
+)
+from pace.rl.policy import Agent
+from pace.rl.ppo import PPO
+from pace.rl.progress import Progress
+from pace.rl.rollout import Rollout, VectorTask
+from pace.rl.run_folder import RunFolder, plot_learning_curve
+
+CHECKPOINTS_KEPT = 4
+COUNTS = ("serves", "hits", "successes", "falls", "episodes", "steps", "reward_sum")
+
+
+class TrainableTask(VectorTask, PredictorSource, Protocol):
+    """What the trainer asks of an environment beyond the rollout's interface."""
+
+    action_spec: Any
+
+    def pop_statistics(self) -> dict[str, Tensor]:
+        """Sums since the last call, 0-d tensors: serves, hits, successes, falls, episodes, steps, rewards, ..."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that the next control step depends on."""
+        ...
+
+    def load_state_dict(self, state: dict[str, Any], /) -> None:
+        """Restore what :meth:`state_dict` gave."""
+        ...
+
+
+@dataclass(frozen=True)
+class Summary:
+    """How a run ended: why, where its files are, and means over its last updates."""
+
+    reason: str
+    updates: int
+    samples: int
+    seconds: float
+    checkpoint: Path
+    curve: Path | None
+    rates: dict[str, float]
+
+
+class StopRequest:
+    """Set by the first Ctrl-C or SIGTERM; the update that runs is finished, saved, and the run ends."""
+
+    def __init__(self) -> None:
+        self.name: str | None = None
+
+    @contextmanager
+    def listening(self) -> Iterator[None]:
+        """Take the two signals over while the block runs; a second one acts as it would without this class."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+        before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+        def give_back() -> None:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+        def on_signal(number: int, _frame: object) -> None:
+            self.name = signal.Signals(number).name
+            give_back()
+
+        for number in before:
+            signal.signal(number, on_signal)
+        try:
+            yield
+        finally:
+            give_back()
+
+
+class Trainer:
+    """Trains the policy, the critic and the predictor of ``config`` on ``env`` and keeps the run's files.
+
+    ``predictor`` is the network that ``env`` predicts with; it is trained in place.
+    """
+
+    def __init__(self, config: TrainConfig, env: TrainableTask, predictor: PredictorNetwork, run: RunFolder) -> None:
+        self.config, self.env, self.predictor, self.run = config, env, predictor, run
+        self.device = env.policy_observation.device
+        self.num_worlds, policy_size = env.policy_observation.shape
+        critic_size = env.critic_observation.shape[1]
+        self.agent = Agent(policy_size, critic_size, env.action_spec.shape[-1], config.algo, self.device)
+        self.ppo = PPO(self.agent, config.algo)
+        self.rollout = Rollout(env, self.agent, config.algo.steps)
+        self.regression = PredictorTrainer(predictor, config.predictor, config.algo.steps, self.num_worlds)
+        self.updates, self.samples, self.wall_s = 0, 0, 0.0
+        self._stop = StopRequest()
+        self._saved_at = time.monotonic()
+
+    def train(self) -> Summary:
+        """Run until ``samples``, ``minutes`` or a signal; writes checkpoints, metrics and the learning curve.
+
+        Errors: :class:`RolloutError` for values that are not finite; the last good checkpoint then stays the newest.
+        """
+        config = self.config
+        if self.samples >= config.samples:
+            raise ConfigError(f"the run has {self.samples} samples and samples={config.samples:g}: nothing left to do")
+        progress = Progress(config.progress, config.samples, 60.0 * config.minutes, self.samples)
+        started = last = time.monotonic()
+        wall_before, reason = self.wall_s, None
+        try:
+            with self._stop.listening():
+                while reason is None:
+                    row = self.update()
+                    now = time.monotonic()
+                    self.wall_s = wall_before + now - started
+                    row |= {"wall_s": self.wall_s, "samples_per_s": self._samples_per_update / (now - last)}
+                    last = now
+                    self.run.log(row)
+                    progress.show(row)
+                    reason = self._reason_to_end(now - started)
+                    self._save_when_due(final=reason is not None)
+        finally:
+            progress.close()
+            self.run.close()
+            curve = plot_learning_curve(self.run.path)
+        rates = {n: progress.mean(n) for n in ("hit_rate", "success_rate", "fall_rate", "predictor_rmse_cm")}
+        newest = list_checkpoints(self.run.path)[-1]
+        return Summary(reason, self.updates, self.samples, self.wall_s, newest, curve, rates)
+
+    @property
+    def _samples_per_update(self) -> int:
+        return self.num_worlds * self.config.algo.steps
+
+    def update(self) -> dict[str, float]:
+        """One rollout and what is learned from it; returns the row of metrics, without the times."""
+        self.rollout.begin()
+        for t in range(self.rollout.steps):
+            self.regression.record(t, self.env)
+            self.rollout.step(t)
+        self.rollout.finish(self.config.algo.gamma, self.config.algo.gae_lambda)
+        self.rollout.check()
+        prediction = self.regression.update()
+        learning = self.ppo.update(self.rollout, self.samples)
+        self.samples += self._samples_per_update
+        self.updates += 1
+        task = summarise(self.env.pop_statistics(), self.config.robot.control_dt)
+        return {"update": self.updates, "samples": self.samples, **task, **prediction, **learning}
+
+    def _reason_to_end(self, seconds: float) -> str | None:
+        if self._stop.name is not None:
+            return f"stopped by {self._stop.name}"
+        if self.samples >= self.config.samples:
+            return f"samples={self.config.samples:g} reached"
+        if 0 < 60.0 * self.config.minutes <= seconds:
+            return f"minutes={self.config.minutes:g} reached"
+        return None
+
+    def _save_when_due(self, final: bool) -> None:
+        due = time.monotonic() - self._saved_at >= 60.0 * self.config.checkpoint_minutes
+        if final or due:
+            self.save()
+
+    def save(self) -> Path:
+        """Write a checkpoint of this moment and drop old ones; returns its folder."""
+        folder = self.run.path / FOLDER / f"update_{self.updates:08d}"
+        save_checkpoint(folder, self.checkpoint())
+        prune_checkpoints(self.run.path, CHECKPOINTS_KEPT)
+        self._saved_at = time.monotonic()
+        return folder
+
+    def checkpoint(self) -> Checkpoint:
+        """Everything that the next update depends on."""
+        random_state = {"cpu": torch.get_rng_state()}
+        if self.device.type == "cuda":
+            random_state["cuda"] = torch.cuda.get_rng_state(self.device)
+        return Checkpoint(
+            config=to_dict(self.config),
+            counters={"updates": self.updates, "samples": self.samples, "wall_s": self.wall_s},
+            weights={"agent": self.agent.state_dict(), "predictor": self.predictor.state_dict()},
+            training={
+                "ppo": self.ppo.state_dict(),
+                "regression": self.regression.state_dict(),
+                "random": random_state,
+                "env": self.env.state_dict(),
+            },
+        )
+
+    def load_weights(self, checkpoint: Checkpoint) -> None:
+        """Start from another run's policy, critic, normalisers and predictor.
+
+        Errors: :class:`CheckpointError` for a missing or reshaped tensor.
+        """
+        for part, module in (("agent", self.agent), ("predictor", self.predictor)):
+            if part not in checkpoint.weights:
+                raise CheckpointError(f"{checkpoint.path}: the weights of the {part} are missing")
+            load_weights(module, checkpoint.weights[part], f"{checkpoint.path} ({part})")
+        self.agent.actor.bound_std(self.config.algo.std_floor, self.config.algo.std[0].value)
+
+    def resume(self, checkpoint: Checkpoint) -> None:
+        """Go on exactly where ``checkpoint`` was written.
+
+        Errors: :class:`CheckpointError` when it holds weights only or does not fit this configuration.
+        """
+        state = checkpoint.training
+        if state is None:
+            raise CheckpointError(f"{checkpoint.path} holds weights only: use init_from instead of resume")
+        self.load_weights(checkpoint)
+        try:
+            self.ppo.load_state_dict(state["ppo"])
+            self.regression.load_state_dict(state["regression"])
+            self.env.load_state_dict(state["env"])
+            torch.set_rng_state(state["random"]["cpu"])
+            if self.device.type == "cuda" and "cuda" in state["random"]:
+                torch.cuda.set_rng_state(state["random"]["cuda"], self.device)
+        except (KeyError, ValueError, RuntimeError) as error:
+            raise CheckpointError(f"{checkpoint.path} does not fit this configuration: {error}") from error
+        self.updates, self.samples = int(checkpoint.counters["updates"]), int(checkpoint.counters["samples"])
+        self.wall_s = float(checkpoint.counters["wall_s"])
+
+
+def summarise(statistics: dict[str, Tensor], control_dt: float) -> dict[str, float]:
+    """Rates of the last rollout from the environment's sums; NaN where nothing was counted.
+
+    ``hit_rate`` and ``success_rate`` are shares of the serves that ended, ``fall_rate`` is falls per second of a
+    world's time, rewards are means per control step, and every other sum is given per serve.
+    """
+    sums = dict(zip(statistics, torch.stack([v.float() for v in statistics.values()]).tolist(), strict=True))
+
+    def share(name: str, of: str) -> float:
+        return sums[name] / sums[of] if sums[of] > 0 else math.nan
+
+    row = {
+        "hit_rate": share("hits", "serves"),
+        "success_rate": share("successes", "serves"),
+        "fall_rate": share("falls", "steps") / control_dt,
+        "mean_reward": share("reward_sum", "steps"),
+        "episodes": sums["episodes"],
+        "serves": sums["serves"],
+    }
+    for name in sums:
+        if name.startswith("reward/"):
+            row[name] = share(name, "steps")
+        elif name not in COUNTS:
+            row[name] = share(name, "serves")
+    return row

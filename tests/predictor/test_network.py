@@ -1,0 +1,77 @@
+"""The predictor's layout, its scaling, and its errors."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from pace.config import ConfigError, PredictorConfig, load_train_config
+from pace.predictor.network import PredictorNetwork
+
+
+def predictor_config(**changes: object) -> PredictorConfig:
+    config = load_train_config().predictor
+    for name, value in changes.items():
+        setattr(config, name, value)
+    return config
+
+
+def serves(count: int, seed: int = 1) -> tuple[torch.Tensor, torch.Tensor]:
+    """Five positions, 20 ms apart, of balls in free fall, and where they are 0.3 s after the last."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def uniform(low: list[float], high: list[float]) -> torch.Tensor:
+        return torch.tensor(low) + (torch.tensor(high) - torch.tensor(low)) * torch.rand(count, 3, generator=generator)
+
+    start = uniform([-0.2, -0.3, 0.9], [0.8, 0.3, 1.1])
+    velocity = uniform([-6.5, -0.8, 0.5], [-5.0, 0.4, 2.0])
+    drop = torch.tensor([0.0, 0.0, -4.905])
+
+    def at(time: torch.Tensor) -> torch.Tensor:
+        return start[:, None] + velocity[:, None] * time[:, None] + drop * time[:, None] ** 2
+
+    frames = at(torch.arange(-4, 1) * 0.02)
+    return frames.flatten(1), at(torch.tensor([0.3]))[:, 0]
+
+
+def test_sizes_and_slices_follow_the_configuration() -> None:
+    full = PredictorNetwork(predictor_config(outputs=["apex", "target", "target_time"]))
+    assert (full.input_size, full.output_size) == (15, 7)
+    assert full.slices == {"apex": slice(0, 3), "target": slice(3, 6), "target_time": slice(6, 7)}
+    apex = PredictorNetwork(predictor_config(outputs=["apex"], frames=3))
+    assert (apex.input_size, apex.output_size) == (9, 3)
+    assert apex(torch.zeros(4, 9)).shape == (4, 3)
+
+
+def test_features_are_the_newest_position_and_the_steps_between_frames() -> None:
+    network = PredictorNetwork(predictor_config())
+    frames = torch.tensor([[0.2, 0, 1], [0.1, 0, 1], [0.0, 0, 1], [-0.1, 0, 1], [-0.2, 0.4, 1.25]])
+    features = network.features(frames.flatten()[None])[0]
+    torch.testing.assert_close(features[:3], torch.tensor([-0.2, 1.0, 1.0]))
+    torch.testing.assert_close(features[3:6], torch.tensor([0.5, 0.0, 0.0]))  # (-0.10 + 0.11) / 0.02
+    torch.testing.assert_close(features[12:], torch.tensor([0.5, 20.0, 0.25 / 0.03]))
+
+
+def test_features_of_real_serves_are_of_order_one() -> None:
+    network = PredictorNetwork(predictor_config())
+    features = network.features(serves(2000)[0])
+    assert features.mean(0).abs().max().item() < 1.5
+    assert features.std(0).min().item() > 0.2
+    assert features.std(0).max().item() < 1.5
+
+
+def test_target_scaling_is_the_inverse_of_the_output_scaling() -> None:
+    network = PredictorNetwork(predictor_config())
+    positions = serves(50)[0]
+    torch.testing.assert_close(
+        network.scale_target(network(positions)), network.scaled(positions), atol=1e-5, rtol=1e-4
+    )
+
+
+def test_a_wrong_configuration_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"predictor\.outputs"):
+        PredictorNetwork(predictor_config(outputs=["apex", "spin"]))
+    with pytest.raises(ConfigError, match=r"predictor\.outputs"):
+        PredictorNetwork(predictor_config(outputs=["target"]))
+    with pytest.raises(ConfigError, match=r"predictor\.frames"):
+        PredictorNetwork(predictor_config(frames=1))

@@ -1,0 +1,199 @@
+"""The training loop on a dummy task: it learns, repeats by seed, resumes exactly, and leaves a checkpoint behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+
+import pytest
+import torch
+from dummy import DummyTask
+from omegaconf import OmegaConf
+
+from pace.config import ConfigError, TrainConfig, load_train_config, parse, to_dict
+from pace.predictor.network import PredictorNetwork
+from pace.rl.checkpoint import CheckpointError, list_checkpoints, load_checkpoint
+from pace.rl.rollout import RolloutError
+from pace.rl.run_folder import RunFolder, read_metrics
+from pace.rl.trainer import Trainer, summarise
+
+WORLDS = 64
+UPDATE = WORLDS * 12
+
+
+def make_config(updates: int = 2, **changes: object) -> TrainConfig:
+    config = load_train_config(
+        [
+            f"num_worlds={WORLDS}",
+            f"samples={updates * UPDATE}",
+            "algo.actor_hidden=[32,32]",
+            "algo.critic_hidden=[32,32]",
+            "algo.autocast=fp32",
+            "predictor.batches_per_update=4",
+            "tensorboard=false",
+            "progress=false",
+        ]
+    )
+    for name, value in changes.items():
+        setattr(config, name, value)
+    return config
+
+
+def make_trainer(path: Path, updates: int = 2, resume: bool = False, **changes: object) -> Trainer:
+    config = make_config(updates, **changes)
+    torch.manual_seed(config.seed)
+    saved = load_checkpoint(path) if resume else None
+    predictor = PredictorNetwork(config.predictor)
+    first = int(saved.counters["updates"]) if saved else 0
+    run = RunFolder(path, to_dict(config), config.tensorboard, first)
+    trainer = Trainer(config, DummyTask(WORLDS, config.seed), predictor, run)
+    if saved:
+        trainer.resume(saved)
+    return trainer
+
+
+def all_weights(trainer: Trainer) -> dict[str, torch.Tensor]:
+    return {**trainer.agent.state_dict(), **{f"predictor.{k}": v for k, v in trainer.predictor.state_dict().items()}}
+
+
+def test_it_learns_the_dummy_task(tmp_path: Path) -> None:
+    trainer = make_trainer(tmp_path, updates=60)
+    before = {name: value.clone() for name, value in all_weights(trainer).items()}
+    summary = trainer.train()
+    metrics = read_metrics(tmp_path / "metrics.csv")
+    assert len(metrics["update"]) == 60
+    assert sum(metrics["mean_reward"][-5:]) / 5 > 0.5 * metrics["mean_reward"][0]  # rewards are negative distances
+    assert metrics["predictor_rmse_cm"][-1] < 0.7 * metrics["predictor_rmse_cm"][0]
+    assert metrics["samples"][-1] == 60 * UPDATE
+    assert metrics["reward/distance"] == metrics["mean_reward"]
+    assert all(not torch.equal(before[name], value) for name, value in all_weights(trainer).items())
+    assert summary.reason.startswith("samples=")
+    assert summary.curve is not None
+    assert summary.curve.stat().st_size > 10_000
+
+
+def test_a_seed_reproduces_and_another_does_not(tmp_path: Path) -> None:
+    weights = []
+    for index, seed in enumerate((1, 1, 2)):
+        trainer = make_trainer(tmp_path / str(index), seed=seed)
+        trainer.train()
+        weights.append(all_weights(trainer))
+    first, same, other = weights
+    assert all(torch.equal(first[name], same[name]) for name in first)
+    assert not torch.equal(first["actor.mlp.layers.0.weight"], other["actor.mlp.layers.0.weight"])
+
+
+def test_two_and_two_updates_equal_four(tmp_path: Path) -> None:
+    whole = make_trainer(tmp_path / "whole", updates=4)
+    whole.train()
+    make_trainer(tmp_path / "parts", updates=2).train()
+    resumed = make_trainer(tmp_path / "parts", updates=4, resume=True)
+    assert resumed.updates == 2
+    resumed.train()
+    expected, found = all_weights(whole), all_weights(resumed)
+    assert all(torch.equal(expected[name], found[name]) for name in expected)
+    rows = [read_metrics(tmp_path / run / "metrics.csv") for run in ("whole", "parts")]
+    assert rows[0]["update"] == rows[1]["update"] == [1, 2, 3, 4]
+    for column in ("mean_reward", "kl", "lr", "predictor_rmse_cm", "policy_std"):
+        assert rows[0][column] == rows[1][column]
+
+
+def test_rows_after_the_checkpoint_are_replaced_by_a_resume(tmp_path: Path) -> None:
+    make_trainer(tmp_path, updates=2).train()
+    with (tmp_path / "metrics.csv").open("a") as file:
+        file.write("3,99999\n")  # an update that the interrupted run logged and did not save
+    make_trainer(tmp_path, updates=3, resume=True).train()
+    assert read_metrics(tmp_path / "metrics.csv")["samples"] == [UPDATE, 2 * UPDATE, 3 * UPDATE]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_run_with_a_checkpoint(tmp_path: Path, number: signal.Signals) -> None:
+    trainer = make_trainer(tmp_path, updates=1000)
+    advance = trainer.env.advance
+    calls = 0
+
+    def interrupted(action: torch.Tensor) -> None:
+        nonlocal calls
+        calls += 1
+        if calls == 30:  # in the third update
+            os.kill(os.getpid(), number)
+        advance(action)
+
+    trainer.env.advance = interrupted  # type: ignore[method-assign]
+    before = signal.getsignal(number)
+    summary = trainer.train()
+    assert signal.getsignal(number) is before
+    assert summary.reason == f"stopped by {number.name}"
+    assert summary.updates == 3
+    assert load_checkpoint(tmp_path).counters["updates"] == 3
+    assert (tmp_path / "learning_curve.png").exists()
+
+
+def test_a_nan_keeps_the_last_good_checkpoint(tmp_path: Path) -> None:
+    trainer = make_trainer(tmp_path, updates=10, checkpoint_minutes=0.0)
+    trainer.env.poison_step = 30  # type: ignore[attr-defined]
+    with pytest.raises(RolloutError, match="column 1 of world 3 "):
+        trainer.train()
+    saved = load_checkpoint(tmp_path)
+    assert saved.counters["updates"] == 2
+    assert all(torch.isfinite(tensor).all() for tensor in saved.weights["agent"].values())
+
+
+def test_minutes_end_a_run(tmp_path: Path) -> None:
+    summary = make_trainer(tmp_path, updates=10_000, minutes=0.5 / 60).train()
+    assert summary.reason.startswith("minutes=")
+    assert summary.seconds < 10
+
+
+def test_old_checkpoints_are_dropped(tmp_path: Path) -> None:
+    make_trainer(tmp_path, updates=7, checkpoint_minutes=0.0).train()
+    assert [int(folder.name[7:]) for folder in list_checkpoints(tmp_path)] == [4, 5, 6, 7]
+
+
+def test_run_folder_holds_what_rebuilds_the_run(tmp_path: Path) -> None:
+    trainer = make_trainer(tmp_path, tensorboard=True)
+    trainer.train()
+    config = parse(OmegaConf.load(tmp_path / "config.yaml"), TrainConfig)  # type: ignore[arg-type]
+    assert config == trainer.config
+    assert parse(load_checkpoint(tmp_path).config, TrainConfig) == trainer.config
+    assert json.loads((tmp_path / "versions.json").read_text())["packages"]["torch"] == torch.__version__
+    assert list((tmp_path / "events").glob("events.out.tfevents*"))
+
+
+def test_init_from_takes_the_weights_and_nothing_else(tmp_path: Path) -> None:
+    old = make_trainer(tmp_path / "old", updates=3)
+    old.train()
+    new = make_trainer(tmp_path / "new")
+    new.load_weights(load_checkpoint(tmp_path / "old", weights_only=True))
+    assert new.samples == 0
+    expected, found = all_weights(old), all_weights(new)
+    assert all(torch.equal(expected[name], found[name]) for name in expected)
+    assert not new.ppo.actor_optimiser.state
+
+
+def test_weights_of_another_size_are_refused(tmp_path: Path) -> None:
+    make_trainer(tmp_path / "old").train()
+    config = make_config()
+    config.algo.actor_hidden = [48, 32]
+    new = Trainer(config, DummyTask(WORLDS), PredictorNetwork(config.predictor), RunFolder(tmp_path / "new", {}, False))
+    with pytest.raises(CheckpointError, match=r"actor\.mlp\.layers\.0\.weight has the shape \(32, 6\)"):
+        new.load_weights(load_checkpoint(tmp_path / "old"))
+
+
+def test_a_finished_run_has_nothing_left_to_do(tmp_path: Path) -> None:
+    make_trainer(tmp_path).train()
+    with pytest.raises(ConfigError, match="nothing left to do"):
+        make_trainer(tmp_path, resume=True).train()
+
+
+def test_rates_of_the_statistics() -> None:
+    sums = {
+        "serves": 8.0, "hits": 4.0, "successes": 2.0, "falls": 3.0, "episodes": 5.0, "steps": 600.0,
+        "reward_sum": 60.0, "reward/hit": 30.0, "net": 1.0,
+    }  # fmt: skip
+    row = summarise({name: torch.tensor(value) for name, value in sums.items()}, control_dt=0.02)
+    assert (row["hit_rate"], row["success_rate"], row["net"]) == (0.5, 0.25, 0.125)
+    assert row["fall_rate"] == pytest.approx(0.25)  # 3 falls in 600 x 0.02 s
+    assert (row["mean_reward"], row["reward/hit"]) == pytest.approx((0.1, 0.05))
