@@ -29,7 +29,7 @@ bench: venv  ## measure speed and memory: python -m pace.bench $(ARGS)
 venv:  ## make or renew .venv from requirements.lock
 	@set -e; \
 	if cat requirements.lock pyproject.toml | cmp -s - $(VENV)/.installed && $(BIN)/python -c "" 2>/dev/null; then exit 0; fi; \
-	if ! $(BIN)/python -m pip --version >/dev/null 2>&1; then \
+	if ! $(BIN)/python -c 'import sys, pip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then \
 	  for candidate in $(PYTHON); do \
 	    if $$candidate -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; \
 	    then python=$$candidate; break; fi; \
@@ -55,7 +55,7 @@ lock:  ## renew requirements.lock
 	python3.11 -m venv $$scratch; \
 	$$scratch/bin/pip install --quiet torch==$(TORCH) ".[viewer,export,dev]"; \
 	{ grep '^#' requirements.lock; \
-	  $$scratch/bin/pip freeze --exclude pace-table-tennis | sed 's/+cpu$$//'; } > $$scratch/requirements.lock; \
+	  $$scratch/bin/pip freeze --all --exclude pip --exclude pace-table-tennis | sed 's/+cpu$$//'; } > $$scratch/requirements.lock; \
 	mv $$scratch/requirements.lock requirements.lock; \
 	wc -l requirements.lock
 
