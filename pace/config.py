@@ -180,6 +180,7 @@ class RewardConfig:
     target_mode: str  # "intercept": later of apex and x = target_x; "clamp": apex with its x clamped (released code)
     arm_offset: list[float]  # m; base target = target_xy + arm_offset
     idle_base_xy: list[float]  # m; base target while there is nothing to hit
+    idle_height: float  # m; height of the paddle's target meanwhile
     nothing_to_hit: dict[str, float]  # past_x, low_z, falling_x (m): when the prediction terms are off
     terms: dict[str, RewardTerm]
 
@@ -381,6 +382,99 @@ class TrainConfig(TaskConfig):
         _require(self.num_worlds >= 1, f"num_worlds must be at least 1, got {self.num_worlds}")
         _require(self.samples > 0, "samples must be positive")
         _require(not (self.resume and self.init_from), "give resume or init_from, not both")
+
+
+@dataclass
+class BenchOptions:
+    """What ``python -m pace.bench`` measures, and how long."""
+
+    parts: list[str]  # of physics, mjwarp, update, train, memory
+    repeats: int
+    settle_steps: int  # control steps
+    control_steps: int
+    mjwarp_steps: int  # control steps
+    action_std: float
+    update_worlds: int
+    policy_size: int
+    critic_size: int
+    train_updates: int
+    memory_updates: int
+
+    def __post_init__(self) -> None:
+        known = ("physics", "mjwarp", "update", "train", "memory")
+        for part in self.parts:
+            _require(part in known, f"bench.parts: {part!r} is not one of {', '.join(known)}")
+        for name, value in vars(self).items():
+            if isinstance(value, int):
+                _require(value >= 1, f"bench.{name} must be at least 1, got {value}")
+
+
+@dataclass
+class BenchConfig(TrainConfig):
+    """``python -m pace.bench``: what is trained, and how it is measured."""
+
+    bench: BenchOptions
+
+
+@dataclass
+class PaperRow:
+    """A row of the paper's table I."""
+
+    serves: int
+    hit: float  # share of the serves
+    success: float  # share of the serves
+
+
+@dataclass
+class VariationConfig:
+    """Values of each change of ``python -m pace.rl.evaluate --sweep``, one change at a time."""
+
+    ball: list[str]  # presets
+    engine: list[str]
+    noise: list[float]  # times the sensing noise
+    latency: list[float]  # s added to the delay of motion capture
+    friction: list[float]  # added to the friction of the robot's bodies
+    trunk_mass: list[float]  # kg added
+    gain: list[float]  # times kp and kd
+
+    def __post_init__(self) -> None:
+        for name in ("noise", "latency", "gain"):
+            _require(min(getattr(self, name), default=0.0) >= 0, f"variations.{name} must not be negative")
+
+
+@dataclass
+class EvaluateConfig:
+    """``python -m pace.rl.evaluate``: which policy, on what task, how many serves. ``None`` keeps what was saved."""
+
+    run: str | None
+    policy: str  # run, zero, random
+    rows: list[str]  # names of configs/serve/
+    serves: int  # at least so many a row
+    warmup_serves: int  # first serves of each world, not counted
+    num_worlds: int
+    device: str
+    seed: int
+    engine: str | None
+    physics_dt: float  # s
+    ball: str | None
+    randomization: str | None
+    sensing: str | None
+    overrides: list[str]
+    out: str | None
+    progress: bool
+    sweep: bool
+    sweep_serves: int
+    sweep_rows: list[str]
+    variations: VariationConfig
+    paper: dict[str, PaperRow]
+
+    def __post_init__(self) -> None:
+        _require(self.policy in ("run", "zero", "random"), f"policy must be run, zero or random, not {self.policy!r}")
+        _require(self.policy != "run" or self.run is not None, "which run? give its folder, or policy=zero|random")
+        _require(len(self.rows) > 0, "rows must name at least one serve range")
+        for name in ("serves", "sweep_serves", "num_worlds"):
+            _require(getattr(self, name) >= 1, f"{name} must be at least 1, got {getattr(self, name)}")
+        _require(self.warmup_serves >= 0, f"warmup_serves must not be negative, got {self.warmup_serves}")
 
 
 def parse(config: DictConfig | dict[str, Any], schema: type[T]) -> T:

@@ -1,0 +1,380 @@
+"""The table-tennis environment: N worlds in place, and as a TorchRL environment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from pace.config import ConfigError, TaskConfig
+from pace.rl.observations import (
+    CRITIC,
+    POLICY,
+    ActorSignals,
+    CriticSignals,
+    History,
+    Predictor,
+    check_critic,
+    check_policy,
+    layout,
+)
+from pace.rl.rewards import RewardManager
+from pace.rl.state import TaskState
+from pace.rl.statistics import Statistics
+from pace.rl.task import Game, PoseSampler, ServeSampler, lost_position
+from pace.sim.sensing import Sensing
+from pace.sim.snapshot import restore, snapshot, under_prefix, with_prefix
+from pace.sim.worlds import Worlds
+
+#: The environment's own part of its state; the rest belongs to its parts.
+OWN_TENSORS = (
+    "truncated",
+    "serve_over",
+    "serve_hit",
+    "serve_outcome",
+    "predictor_target",
+    "predictor_time_to_apex",
+    "_bad_term",
+)
+
+
+class TableTennisEnv(EnvBase):
+    """N worlds of a humanoid that returns serves; batch size [N].
+
+    As a TorchRL environment: ``policy`` (N, Dp) and ``critic`` (N, Dc) float32 observations, ``action`` (N, 21) in
+    units of ``robot.action_scale`` rad from the nominal pose, ``reward``, ``terminated``, ``truncated`` and ``done``
+    (N, 1). Under it lies an in-place interface without copies, :meth:`advance` and :meth:`reset_worlds`. The
+    constructor resets all worlds.
+
+    Attributes, overwritten in place: ``policy_observation`` (N, Dp), ``critic_observation`` (N, Dc), ``reward``,
+    ``terminated``, ``truncated`` (N,); for the predictor's regression ``predictor_input`` (N, 3 * frames) m sensed,
+    oldest first, ``predictor_target`` (N, P) truth in the order of ``predictor.outputs`` (times from now, s),
+    ``predictor_valid`` (N,) bool, ``predictor_time_to_apex`` (N,) s; for evaluation ``serve_over`` (N,) bool,
+    ``serve_outcome`` (N,) int (:class:`pace.rl.task.Outcome`) and ``serve_hit`` (N,) bool of the serves that ended in
+    this step. ``warmup_serves``: so many first serves of each world are left out of the statistics.
+
+    Args:
+        config: the task.
+        num_worlds: N.
+        device: ``auto``, ``cpu``, ``cuda``, ...
+        seed: of every random draw; the same seed on the same device repeats a run exactly.
+        predictor: callable (N, 3 * frames) -> (N, P), used as it is at each step; ``None``: predictions are zero.
+        worlds: simulation to use instead of a new one, on the same device and with its own generator.
+
+    Errors: :class:`pace.config.ConfigError` for num_worlds < 1 and unknown names of observations or rewards.
+    """
+
+    def __init__(
+        self,
+        config: TaskConfig,
+        num_worlds: int,
+        device: str | torch.device = "auto",
+        seed: int = 1,
+        predictor: Predictor | None = None,
+        worlds: Worlds | None = None,
+    ) -> None:
+        if num_worlds < 1:
+            raise ConfigError(f"num_worlds must be at least 1, got {num_worlds}")
+        check_policy(config.observation.policy, config.predictor)
+        check_critic(config.observation.critic)
+        worlds = worlds or Worlds(config, num_worlds, device)
+        super().__init__(device=worlds.device, batch_size=(num_worlds,))
+        self.config, self.num_worlds, self.worlds = config, num_worlds, worlds
+        self.generator = worlds.generator
+        self.generator.manual_seed(seed)
+        self._build(predictor)
+        self._allocate()
+        self._make_specs()
+        self.reset_worlds(self._everyone)
+
+    def _build(self, predictor: Predictor | None) -> None:
+        config, worlds, device = self.config, self.worlds, self.worlds.device
+        reward = config.reward
+        self._serves = ServeSampler(config.serve, self.generator, device)
+        limits = (worlds.joint_lower, worlds.joint_upper)
+        self._poses = PoseSampler(
+            config.reset, config.robot, worlds.nominal, limits, worlds.joint_names, self.generator
+        )
+        self.game = Game(config.serve, reward, self.num_worlds, device)
+        self.task_state = TaskState(worlds, self.game, reward)
+        self.rewards = RewardManager(reward, self.num_worlds, device, worlds.control_dt)
+        self.sensing = Sensing(
+            config.sensing, self.num_worlds, device, worlds.control_dt, worlds.nominal, self.generator
+        )
+        idle_point = self.game.target.idle_point
+        self.actor = ActorSignals(
+            self.sensing, worlds.kinematics, worlds.nominal, predictor, reward, config.predictor, idle_point
+        )
+        self.critic = CriticSignals(self.task_state, reward)
+        self.statistics = Statistics(self.num_worlds, device)
+
+    def _allocate(self) -> None:
+        names, count, device = self.config.observation, self.num_worlds, self.worlds.device
+        self.policy_layout, self.critic_layout = layout(names.policy, POLICY), layout(names.critic, CRITIC)
+        policy_size = sum(POLICY[name].size for name in names.policy)
+        critic_size = sum(CRITIC[name].size for name in names.critic)
+        self._policy_history = History(names.policy_history, policy_size, count, device)
+        self._critic_history = History(names.critic_history, critic_size, count, device)
+        self.policy_observation = self._policy_history.observation
+        self.critic_observation = self._critic_history.observation
+        self.reward = self.rewards.reward
+        self.predictor_input = self.actor.track.positions
+        self.predictor_target = torch.zeros_like(self.actor.prediction)
+        self.predictor_valid = self.task_state.something_to_hit
+        self.predictor_time_to_apex = torch.zeros(count, device=device)
+        self._everyone = torch.ones(count, dtype=torch.bool, device=device)
+        self.terminated, self.truncated = self.task_state.lost, torch.zeros_like(self._everyone)
+        self.serve_over, self.serve_hit = torch.zeros_like(self._everyone), torch.zeros_like(self._everyone)
+        self.serve_outcome = torch.zeros_like(self.game.referee.outcome)
+        self._bad_term = torch.full((count,), -1, dtype=torch.long, device=device)
+
+    @property
+    def warmup_serves(self) -> int:
+        """So many first serves of each world are left out of the statistics."""
+        return self.statistics.warmup_serves
+
+    @warmup_serves.setter
+    def warmup_serves(self, count: int) -> None:
+        self.statistics.warmup_serves = count
+
+    # --- in place -----------------------------------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def advance(self, action: Tensor) -> None:
+        """One control step with ``action`` (N, 21), clipped to +- ``robot.action_clip``.
+
+        Order: (1) the action becomes joint targets; robot and ball move through the step, with the action's and the
+        sensors' delays inside it. (2) The referee consumes the ball's events in the order of their times; balls that
+        were hit get a forecast of their flight. (3) Falls and the ends of serves are seen, and serves that end are
+        decided. (4) Rewards, on that state. (5) Where a serve is over and the robot stands, the next serve begins at
+        once; also where the episode is truncated, so that its last observation, from which the value is bootstrapped,
+        is what would have come next. (6) Sensors, predictor, observations. Nothing is reset here: the observations
+        of worlds that are done are their last ones, until :meth:`reset_worlds`.
+        """
+        self._move(action)
+        self._judge()
+        self.task_state.refresh()
+        self.rewards.compute(self.task_state)
+        next_serve = self.serve_over & ~self.terminated
+        self.statistics.add(self)
+        self.game.clock.finish(self.serve_over)
+        self._start_serves(next_serve)
+        self.sensing.update(self.worlds.robot, self.worlds.ball.position, next_serve)
+        self.actor.track.update(self.sensing.ball_position, next_serve)
+        self._compute_signals()
+        self._policy_history.push(self._policy_signals())
+        self._critic_history.push(self._critic_signals())
+        self._flag_bad()
+
+    @torch.no_grad()
+    def reset_worlds(self, mask: Tensor) -> None:
+        """Begin new episodes in the worlds of ``mask`` (N,) bool and refresh their observations; others keep theirs.
+
+        Samples are drawn for all worlds and kept by mask. On a CPU, where looking costs no wait, an empty mask returns
+        at once.
+        """
+        if self.worlds.device.type == "cpu" and not bool(mask.any()):
+            return
+        qpos, qvel = self._poses.sample(self.num_worlds)
+        self.worlds.reset_robot(mask, qpos, qvel)
+        self.game.clock.start_episode(mask, self.generator)
+        self._start_serves(mask)
+        for history in (self.task_state.action, self.task_state.previous_action, self.actor.action):
+            history.masked_fill_(mask.unsqueeze(-1), 0.0)
+        self.sensing.reset(mask, self.worlds.robot, self.worlds.ball.position)
+        self.actor.track.restart(mask, self.sensing.ball_position)
+        self.task_state.refresh()
+        self._compute_signals()
+        self._policy_history.fill(mask, self._policy_signals())
+        self._critic_history.fill(mask, self._critic_signals())
+
+    def _move(self, action: Tensor) -> None:
+        robot, state = self.config.robot, self.task_state
+        state.previous_action.copy_(state.action)
+        torch.clamp(action, -robot.action_clip, robot.action_clip, out=state.action)
+        self.actor.action.copy_(state.action)
+        self.worlds.step(torch.add(self.worlds.nominal, state.action, alpha=robot.action_scale))
+
+    def _judge(self) -> None:
+        """Referee, forecast of the returns, ends of serves and episodes."""
+        ball, game, clock = self.worlds.ball, self.game, self.game.clock
+        events = ball.events
+        game.referee.judge(events, clock.time, ball.position[:, 0])
+        clock.time += self.worlds.control_dt
+        hits = game.referee.hit_now
+        ball.forecast(
+            hits, events.hit_position, events.hit_velocity_out, events.hit_spin_out, self.config.reward.target_x
+        )
+        game.returns.take(hits, ball.forecast_result)
+        distance = ball.nearest_paddle_distance - ball.params.radius
+        game.closeness.update(game.referee, distance, clock.time >= game.target.time)
+        over = clock.over(ball.position[:, 2], events.floor, game.referee.touch_time)
+        self.terminated.copy_(lost_position(self.worlds.robot.base_position, self.config.reset))
+        game.referee.close(over, self.terminated, game.returns)
+        torch.logical_or(over, self.terminated, out=self.serve_over)
+        self.serve_outcome.copy_(game.referee.outcome)
+        self.serve_hit.copy_(game.referee.hit)
+        torch.logical_and(over & clock.last_serve(), ~self.terminated, out=self.truncated)
+
+    def _start_serves(self, mask: Tensor) -> None:
+        ball = self.worlds.ball
+        self.worlds.serve(mask, *self._serves.sample(self.num_worlds))
+        ball.forecast(mask, ball.position, ball.velocity, ball.spin, self.config.reward.target_x)
+        self.game.start_serve(mask, ball.forecast_result)
+
+    def _compute_signals(self) -> None:
+        """What both networks see, and what the predictor is taught, from the current state."""
+        self.task_state.refresh_target()
+        self.actor.compute()
+        self.critic.compute()
+        target, now = self.game.target, self.game.clock.time
+        torch.sub(target.apex_time, now, out=self.predictor_time_to_apex)
+        truth = {"apex": target.apex, "target": target.point, "target_time": (target.time - now).unsqueeze(-1)}
+        torch.cat([truth[name] for name in self.config.predictor.outputs], dim=1, out=self.predictor_target)
+
+    def _policy_signals(self) -> list[Tensor]:
+        return [POLICY[name].function(self.actor) for name in self.config.observation.policy]
+
+    def _critic_signals(self) -> list[Tensor]:
+        return [CRITIC[name].function(self.critic) for name in self.config.observation.critic]
+
+    # --- faults, statistics, state ------------------------------------------------------------------------------------
+
+    def _flag_bad(self) -> None:
+        """Remember the first value of each world that is not finite: a reward term, or an observation."""
+        terms = self.rewards.values.isfinite().logical_not_()
+        frames = (self._policy_history.frame.sum(1) + self._critic_history.frame.sum(1)).isfinite().logical_not_()
+        found = torch.where(terms.any(0), terms.int().argmax(0), len(self.rewards.names))
+        first = (self._bad_term < 0) & (terms.any(0) | frames)
+        self._bad_term.copy_(torch.where(first, found, self._bad_term))
+
+    def first_bad(self) -> str | None:
+        """World and term of a value that was not finite, or None. Waits for the device: ask once an update."""
+        worlds = (self._bad_term >= 0).nonzero()
+        if worlds.numel() == 0:
+            return None
+        world = int(worlds[0])
+        term = int(self._bad_term[world])
+        name = f"reward term '{self.rewards.names[term]}'" if term < len(self.rewards.names) else self._bad_name(world)
+        return f"{name} of world {world} is not finite"
+
+    def _bad_name(self, world: int) -> str:
+        groups = ((self._policy_history, self.policy_layout), (self._critic_history, self.critic_layout))
+        for history, columns in groups:
+            for name, where in columns.items():
+                if not bool(history.frames[world, :, where].isfinite().all()):
+                    return f"observation '{name}'"
+        return "an observation"
+
+    def pop_statistics(self) -> dict[str, Tensor]:
+        """Sums over worlds and steps since the last call, 0-d tensors: see :class:`pace.rl.statistics.Statistics`;
+        ``reward_sum`` and ``reward/<term>`` as the learner sees them."""
+        terms = self.rewards.pop_sums()
+        sums = self.statistics.pop()
+        sums["reward_sum"] = torch.stack(list(terms.values())).sum()
+        return sums | {f"reward/{name}": value for name, value in terms.items()}
+
+    def _parts(self) -> dict[str, object]:
+        return {
+            "state": self.task_state,
+            "sensing": self.sensing,
+            "track": self.actor.track,
+            "actor": self.actor,
+            "policy": self._policy_history,
+            "critic": self._critic_history,
+            "rewards": self.rewards,
+            "statistics": self.statistics,
+        }
+
+    def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:  # type: ignore[override]
+        """Everything that the next step depends on, as copies: tensors by name, and ``generator``.
+
+        The predictor's weights are not part of it: they belong to whoever made it.
+        """
+        state = with_prefix("worlds", {name: value.clone() for name, value in self.worlds.state_dict().items()})
+        state |= with_prefix("game", self.game.state_dict())
+        for name, part in self._parts().items():
+            state |= with_prefix(name, snapshot(part))
+        own = {f"env.{name}": getattr(self, name).clone() for name in OWN_TENSORS}
+        return state | own | {"generator": self.generator.get_state()}
+
+    def load_state_dict(self, state_dict: dict[str, Any], *args: Any, **kwargs: Any) -> None:  # type: ignore[override]
+        """Put back what :meth:`state_dict` returned; the next step is then the same, bit for bit.
+
+        Errors: ``KeyError`` for a missing tensor, ``RuntimeError`` for another shape (number of worlds, layout).
+        """
+        self.worlds.load_state_dict(under_prefix("worlds", state_dict))
+        self.game.load_state_dict(under_prefix("game", state_dict))
+        for name, part in self._parts().items():
+            restore(part, under_prefix(name, state_dict))
+        for name in OWN_TENSORS:
+            getattr(self, name).copy_(state_dict[f"env.{name}"])
+        self.generator.set_state(state_dict["generator"].cpu())
+
+    # --- TorchRL ------------------------------------------------------------------------------------------------------
+
+    def _make_specs(self) -> None:
+        batch, device = self.batch_size, self.worlds.device
+
+        def floats(size: int) -> Unbounded:
+            return Unbounded(torch.Size((*batch, size)), dtype=torch.float32, device=device)
+
+        def flag() -> Binary:
+            return Binary(1, shape=torch.Size((*batch, 1)), dtype=torch.bool, device=device)
+
+        self.observation_spec = Composite(
+            policy=floats(self.policy_observation.shape[1]),
+            critic=floats(self.critic_observation.shape[1]),
+            shape=batch,
+            device=device,
+        )
+        self.action_spec = floats(self.worlds.nominal.shape[0])
+        self.reward_spec = floats(1)
+        self.done_spec = Composite(done=flag(), terminated=flag(), truncated=flag(), shape=batch, device=device)
+
+    def _observations(self) -> dict[str, Tensor]:
+        return {"policy": self.policy_observation.clone(), "critic": self.critic_observation.clone()}
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self.advance(tensordict["action"])
+        terminated, truncated = self.terminated.unsqueeze(-1), self.truncated.unsqueeze(-1)
+        result = {
+            **self._observations(),
+            "reward": self.reward.unsqueeze(-1).clone(),
+            "terminated": terminated.clone(),
+            "truncated": truncated.clone(),
+            "done": terminated | truncated,
+        }
+        return TensorDict(result, batch_size=self.batch_size, device=self.device)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        self.reset_worlds(self._everyone if mask is None else mask.reshape(self.num_worlds))
+        return TensorDict(self._observations(), batch_size=self.batch_size, device=self.device)
+
+    def _set_seed(self, seed: int | None) -> None:
+        if seed is not None:
+            self.generator.manual_seed(seed)
+
+
+def make_env(
+    num_worlds: int = 64,
+    engine: str = "auto",
+    device: str = "auto",
+    seed: int = 1,
+    overrides: Sequence[str] = (),
+    predictor: Predictor | None = None,
+) -> TableTennisEnv:
+    """An environment with the default configuration of ``configs/train.yaml`` and Hydra ``overrides``.
+
+    Errors: :class:`pace.config.ConfigError` for a wrong key or value, an engine or a device that is not there.
+    """
+    from pace.config import load_train_config
+
+    config = load_train_config([f"num_worlds={num_worlds}", f"engine={engine}", f"seed={seed}", *overrides])
+    return TableTennisEnv(config, num_worlds, device, seed, predictor)

@@ -1,0 +1,336 @@
+"""Reward terms: small pure functions ``(state, params) -> Tensor (N,)`` in a table from name to function.
+
+Weights and parameters live in ``configs/reward/``. :class:`RewardManager` checks names, parameters and shapes, and sums
+``scale * weight * control_dt * value``; that holds for one-off terms too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from pace.config import ConfigError, RewardConfig
+from pace.rl.state import TaskState
+
+Params = Mapping[str, float]
+Term = Callable[[TaskState, Params], Tensor]
+
+
+class RewardFunction(NamedTuple):
+    """A term and the names of the parameters that it needs."""
+
+    function: Term
+    params: tuple[str, ...]
+
+
+#: All terms by name.
+TERMS: dict[str, RewardFunction] = {}
+
+
+def term(*params: str) -> Callable[[Term], Term]:
+    """Enter a function into :data:`TERMS` under its own name."""
+
+    def enter(function: Term) -> Term:
+        TERMS[function.__name__] = RewardFunction(function, params)
+        return function
+
+    return enter
+
+
+def _length(vector: Tensor) -> Tensor:
+    return torch.linalg.vector_norm(vector, dim=-1)
+
+
+def _kernel(error: Tensor, params: Params) -> Tensor:
+    """exp(-max(error, tolerance) / sigma^2): flat near the goal."""
+    return torch.exp(error.clamp(min=params["tolerance"]) * (-1.0 / params["sigma"] ** 2))
+
+
+# --- towards the ball -------------------------------------------------------------------------------------------------
+
+
+@term("tolerance", "sigma")
+def paddle_to_target(state: TaskState, params: Params) -> Tensor:
+    """Nearness of the paddle to its target while there is something to hit; distances in m."""
+    distance = _length(state.robot.paddle_position - state.game.target.point)
+    return _kernel(distance, params) * state.something_to_hit
+
+
+@term("tolerance", "sigma")
+def base_to_target(state: TaskState, params: Params) -> Tensor:
+    """Nearness of the base to its target on the ground, m; the idle position while there is nothing to hit."""
+    return _kernel(_length(state.base_error), params)
+
+
+@term("gain", "limit", "tolerance", "sigma")
+def base_velocity(state: TaskState, params: Params) -> Tensor:
+    """Match of the base's velocity with one proportional to the way left, m/s."""
+    wanted = (params["gain"] * state.base_error).clamp(-params["limit"], params["limit"])
+    return _kernel(_length(wanted - state.robot.base_linear_velocity[:, :2]), params)
+
+
+@term("reach")
+def contact(state: TaskState, params: Params) -> Tensor:
+    """Growth of the best closeness max(0, (reach - d) / reach) of face centre and ball surface in this serve.
+
+    Its sum over a serve is the best closeness, paid once.
+    """
+    closeness = state.game.closeness
+    return _closeness(closeness.nearest, params) - _closeness(closeness.previous, params)
+
+
+def _closeness(distance: Tensor, params: Params) -> Tensor:
+    return (1.0 - distance / params["reach"]).clamp(min=0.0)
+
+
+@term("sigma")
+def arrival(state: TaskState, params: Params) -> Tensor:
+    """Once a serve, when the ball is hit or reaches the target: exp(-d / sigma), d the smallest distance so far, m."""
+    closeness = state.game.closeness
+    return torch.exp(closeness.nearest * (-1.0 / params["sigma"])) * closeness.arrived_now
+
+
+# --- after the hit ----------------------------------------------------------------------------------------------------
+
+
+@term("offset", "x", "y")
+def predicted_landing(state: TaskState, params: Params) -> Tensor:
+    """Once, at the hit: offset minus the distance of the forecast landing to (x, y), m; 0 without a landing."""
+    landing = state.game.returns.landing
+    paid = state.game.referee.hit_now & landing[:, 0].isfinite()
+    x, y = torch.where(paid, landing[:, 0], 0.0), torch.where(paid, landing[:, 1], 0.0)
+    return (params["offset"] - torch.hypot(x - params["x"], y - params["y"])) * paid
+
+
+@term("z", "sigma")
+def predicted_net_height(state: TaskState, params: Params) -> Tensor:
+    """Once, at the hit: how near to z the ball will cross the net's plane towards the opponent, m."""
+    height = state.game.returns.net_height
+    paid = state.game.referee.hit_now & height.isfinite()
+    error = (torch.where(paid, height, 0.0) - params["z"]).abs()
+    return torch.exp(error * (-1.0 / params["sigma"])) * paid
+
+
+@term("at_hit")
+def success(state: TaskState, params: Params) -> Tensor:
+    """Valid return, once: when the ball lands on the opponent's half, or (at_hit) at the hit by its forecast."""
+    if params["at_hit"]:
+        return (state.game.referee.hit_now & state.game.returns.lands_opponent).float()
+    return state.game.referee.success_now.float()
+
+
+@term()
+def unstable_hit(state: TaskState, params: Params) -> Tensor:
+    """At the hit, without both feet down."""
+    return (state.game.referee.hit_now & ~state.foot_contact.all(1)).float()
+
+
+# --- posture and motion of the base -----------------------------------------------------------------------------------
+
+
+@term()
+def base_vertical_velocity(state: TaskState, params: Params) -> Tensor:
+    """Squared, (m/s)^2."""
+    return state.robot.base_linear_velocity[:, 2].square()
+
+
+@term()
+def base_roll_pitch_rate(state: TaskState, params: Params) -> Tensor:
+    """Squared, (rad/s)^2."""
+    return state.robot.base_angular_velocity[:, :2].square().sum(1)
+
+
+@term()
+def base_yaw_rate(state: TaskState, params: Params) -> Tensor:
+    """Squared, (rad/s)^2."""
+    return state.robot.base_angular_velocity[:, 2].square()
+
+
+@term()
+def base_tilt(state: TaskState, params: Params) -> Tensor:
+    """Squared horizontal part of gravity in the body frame."""
+    return state.robot.projected_gravity[:, :2].square().sum(1)
+
+
+@term("x", "margin", "sigma")
+def table_proximity(state: TaskState, params: Params) -> Tensor:
+    """exp(-abs(base x - (x - margin)) / sigma^2): a wall of penalty before the table's edge at x, m."""
+    distance = (state.robot.base_position[:, 0] - (params["x"] - params["margin"])).abs()
+    return torch.exp(distance * (-1.0 / params["sigma"] ** 2))
+
+
+@term()
+def fall(state: TaskState, params: Params) -> Tensor:
+    """The robot fell or left its area: the episode is lost."""
+    return state.lost.float()
+
+
+@term()
+def undesired_contact(state: TaskState, params: Params) -> Tensor:
+    """Number of bodies other than the feet that touch something."""
+    return state.robot.body_contact.sum(1)
+
+
+@term("distance")
+def paddle_near_head(state: TaskState, params: Params) -> Tensor:
+    """How much nearer than ``distance`` the paddle is to the head, m."""
+    return (params["distance"] - _length(state.robot.paddle_position - state.robot.head_position)).clamp(min=0.0)
+
+
+# --- joints -----------------------------------------------------------------------------------------------------------
+
+
+@term()
+def joint_power(state: TaskState, params: Params) -> Tensor:
+    """Norm over the joints of torque times velocity, W."""
+    return state.joint_power.square().sum(1).sqrt()
+
+
+@term()
+def ankle_power(state: TaskState, params: Params) -> Tensor:
+    """The same over the ankles."""
+    return (state.joint_power.square() @ state.groups["ankles"]).sqrt()
+
+
+@term()
+def joint_acceleration(state: TaskState, params: Params) -> Tensor:
+    """Squared, summed over the joints, (rad/s^2)^2."""
+    return state.robot.joint_acceleration.square().sum(1)
+
+
+@term()
+def action_rate(state: TaskState, params: Params) -> Tensor:
+    """Squared change of the action, summed over the joints."""
+    return (state.action - state.previous_action).square().sum(1)
+
+
+@term("fraction")
+def joint_limits(state: TaskState, params: Params) -> Tensor:
+    """How far joints are beyond the inner ``fraction`` of their range, summed, rad."""
+    middle = 0.5 * (state.joint_upper + state.joint_lower)
+    reach = 0.5 * params["fraction"] * (state.joint_upper - state.joint_lower)
+    return ((state.robot.joint_position - middle).abs() - reach).clamp_(min=0.0).sum(1)
+
+
+@term()
+def deviation_hip_waist_left_arm(state: TaskState, params: Params) -> Tensor:
+    """Sum of |joint - nominal| over hip yaw and roll, waist and left arm without its shoulder roll, rad."""
+    return state.joint_deviation @ state.groups["hip_waist_left_arm"]
+
+
+@term()
+def deviation_left_shoulder_roll(state: TaskState, params: Params) -> Tensor:
+    """|joint - nominal|, rad."""
+    return state.joint_deviation @ state.groups["left_shoulder_roll"]
+
+
+@term()
+def deviation_right_arm(state: TaskState, params: Params) -> Tensor:
+    """Sum of |joint - nominal|, rad."""
+    return state.joint_deviation @ state.groups["right_arm"]
+
+
+# --- feet -------------------------------------------------------------------------------------------------------------
+
+
+@term()
+def both_feet_air(state: TaskState, params: Params) -> Tensor:
+    """No foot touches the floor."""
+    return (~state.foot_contact.any(1)).float()
+
+
+@term()
+def foot_tilt(state: TaskState, params: Params) -> Tensor:
+    """Squared horizontal part of the soles' normals, summed over the feet."""
+    return state.robot.foot_up[:, :, :2].square().sum((1, 2))
+
+
+@term()
+def foot_slide(state: TaskState, params: Params) -> Tensor:
+    """Horizontal speed of the feet in contact, summed, m/s."""
+    return (_length(state.robot.foot_velocity[:, :, :2]) * state.foot_contact).sum(1)
+
+
+@term("threshold", "limit")
+def foot_force(state: TaskState, params: Params) -> Tensor:
+    """Force of each foot beyond ``threshold``, at most ``limit``, summed over the feet, N."""
+    return (state.foot_load - params["threshold"]).clamp(0.0, params["limit"]).sum(1)
+
+
+@term("ratio")
+def foot_stumble(state: TaskState, params: Params) -> Tensor:
+    """A foot meets something upright: horizontal force above ``ratio`` times the vertical one."""
+    force = state.robot.foot_force
+    stumbles = _length(force[:, :, :2]) > params["ratio"] * force[:, :, 2].abs()
+    return (stumbles & state.foot_contact).any(1).float()
+
+
+@term("distance")
+def feet_near(state: TaskState, params: Params) -> Tensor:
+    """How much nearer than ``distance`` the feet are to each other, m."""
+    return (params["distance"] - state.feet_distance).clamp(min=0.0)
+
+
+@term("distance")
+def feet_too_near(state: TaskState, params: Params) -> Tensor:
+    """The same, with a second threshold."""
+    return feet_near(state, params)
+
+
+@dataclass
+class _Entry:
+    name: str
+    function: Term
+    params: dict[str, float]
+
+
+class RewardManager:
+    """Computes the reward of N worlds and keeps each term's sum.
+
+    Attributes: ``names`` of the T terms, ``values`` (T, N) unweighted, ``reward`` (N,) as the learner sees it,
+    ``sums`` (T,) of the weighted terms over worlds and steps since the last :meth:`pop_sums`.
+
+    Errors: :class:`ConfigError` for an unknown term, or a missing or unknown parameter.
+    """
+
+    def __init__(self, config: RewardConfig, num_worlds: int, device: torch.device, control_dt: float) -> None:
+        for name, entry in config.terms.items():
+            check_term(name, entry.params)
+        self._entries = [_Entry(name, TERMS[name].function, entry.params) for name, entry in config.terms.items()]
+        self.names = tuple(config.terms)
+        weights = [entry.weight * control_dt * config.scale for entry in config.terms.values()]
+        self._weights = torch.tensor(weights, dtype=torch.float32, device=device)
+        self.values = torch.zeros(len(weights), num_worlds, device=device)
+        self.reward = torch.zeros(num_worlds, device=device)
+        self.sums = torch.zeros(len(weights), device=device)
+
+    def compute(self, state: TaskState) -> None:
+        """Evaluate all terms on ``state``. Errors: ``ValueError`` that names a term whose shape is not (N,)."""
+        for row, entry in zip(self.values, self._entries, strict=True):
+            value = entry.function(state, entry.params)
+            if value.shape != row.shape:
+                raise ValueError(f"reward term '{entry.name}' has shape {tuple(value.shape)}, not {tuple(row.shape)}")
+            row.copy_(value)
+        torch.mv(self.values.T, self._weights, out=self.reward)
+        self.sums.addcmul_(self.values.sum(1), self._weights)
+
+    def pop_sums(self) -> dict[str, Tensor]:
+        """Sums of the weighted terms (0-d) since the last call; they add up to the sum of the rewards."""
+        popped = dict(zip(self.names, self.sums.clone().unbind(), strict=True))
+        self.sums.zero_()
+        return popped
+
+
+def check_term(name: str, params: Params) -> None:
+    """Raise :class:`ConfigError` unless ``name`` is a term and ``params`` are exactly its parameters."""
+    if name not in TERMS:
+        raise ConfigError(f"unknown reward term 'reward.terms.{name}'; known: {', '.join(sorted(TERMS))}")
+    missing = set(TERMS[name].params) - set(params)
+    unknown = set(params) - set(TERMS[name].params)
+    if missing or unknown:
+        what = f"misses {sorted(missing)}" if missing else f"does not know {sorted(unknown)}"
+        raise ConfigError(f"reward.terms.{name}.params {what}; it needs {list(TERMS[name].params)}")
