@@ -26,21 +26,28 @@ def run_command(
     A wrong key, type or value gives one line and status 2; ``failures`` (expected errors of the task) one line and 1.
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises its errors instead of printing and exiting
-    command = hydra.main(config_path=str(config_dir()), config_name=config_name, version_base="1.3")(task)
+    status = 0
+
+    def guarded(config: DictConfig) -> None:
+        nonlocal status  # an error that reached Hydra would be announced a second time
+        try:
+            task(config)
+        except ConfigError as error:
+            status = _complain(str(error), EXIT_USAGE)
+        except failures as error:
+            status = _complain(str(error), EXIT_FAILED)
+
     try:
-        command()
-    except (HydraException, OmegaConfBaseException, ConfigError) as error:
-        return _complain(_one_line(error), EXIT_USAGE)
-    except failures as error:
-        return _complain(str(error), EXIT_FAILED)
+        hydra.main(config_path=str(config_dir()), config_name=config_name, version_base="1.3")(guarded)()
+    except (HydraException, OmegaConfBaseException) as error:
+        return _complain(f"{_first_line(error)} (--help lists the keys)", EXIT_USAGE)
     except KeyboardInterrupt:
         return _complain("interrupted", EXIT_INTERRUPTED)
-    return 0
+    return status
 
 
-def _one_line(error: Exception) -> str:
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[0].rstrip(".") + (" (--help lists the keys)" if not isinstance(error, ConfigError) else "")
+def _first_line(error: Exception) -> str:
+    return str(error).strip().splitlines()[0].rstrip(".")
 
 
 def _complain(message: str, status: int) -> int:

@@ -10,6 +10,12 @@ from collections import deque
 from tqdm import tqdm
 
 SECONDS_PER_LINE = 15.0
+RATES = {  # column: label, factor, digits, unit
+    "hit_rate": ("hit", 100.0, 1, " %"),
+    "success_rate": ("return", 100.0, 1, " %"),
+    "fall_rate": ("falls", 1.0, 3, "/s"),
+    "predictor_rmse_cm": ("predictor", 1.0, 1, " cm"),
+}
 WINDOW = 25  # updates over which the shown rates are taken
 
 
@@ -18,6 +24,15 @@ def clock(seconds: float) -> str:
     whole = max(0, round(seconds))
     hours, rest = divmod(whole, 3600)
     return f"{hours}:{rest // 60:02d}:{rest % 60:02d}" if hours else f"{rest // 60:02d}:{rest % 60:02d}"
+
+
+def rate_texts(rates: dict[str, float]) -> list[str]:
+    """The four rates in words; a dash where nothing was counted yet."""
+    texts = []
+    for name, (label, factor, digits, unit) in RATES.items():
+        value = factor * rates[name]
+        texts.append(f"{label} -" if math.isnan(value) else f"{label} {value:.{digits}f}{unit}")
+    return texts
 
 
 class Progress:
@@ -63,12 +78,13 @@ class Progress:
             f"{row['samples'] / 1e6:.2f} M samples",
             f"{self.mean('samples_per_s'):,.0f}/s",
             f"{clock(left)} left",
-            f"hit {100 * self.mean('hit_rate'):.1f} %",
-            f"return {100 * self.mean('success_rate'):.1f} %",
-            f"falls {self.mean('fall_rate'):.3f}/s",
-            f"predictor {self.mean('predictor_rmse_cm'):.1f} cm",
+            *rate_texts(self.rates()),
         ]
         return " | ".join(parts)
+
+    def rates(self) -> dict[str, float]:
+        """Hit, return and fall rate and the predictor's error over the last updates."""
+        return {name: self.mean(name) for name in RATES}
 
     def mean(self, name: str) -> float:
         """Mean of a column over the last updates, NaN left out; NaN if nothing is there."""

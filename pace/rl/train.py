@@ -21,6 +21,7 @@ from pace.command import run_command
 from pace.config import ConfigError, TrainConfig, parse, to_dict
 from pace.predictor.network import PredictorNetwork
 from pace.rl.checkpoint import Checkpoint, CheckpointError, load_checkpoint
+from pace.rl.progress import rate_texts
 from pace.rl.rollout import RolloutError
 from pace.rl.run_folder import CURVE, METRICS, RunFolder, default_run_dir
 from pace.rl.trainer import Summary, Trainer
@@ -66,6 +67,8 @@ def resumed_config(saved: Checkpoint, path: str, overrides: list[str]) -> TrainC
     changed = OmegaConf.merge(OmegaConf.create(saved.config), OmegaConf.from_dotlist(overrides))
     config = parse(OmegaConf.to_container(changed), TrainConfig)  # type: ignore[arg-type]
     config.resume, config.init_from = path, None
+    if saved.counters["samples"] >= config.samples:
+        raise ConfigError(f"{path} has {saved.counters['samples']} samples: give samples= above that to go on")
     if saved.path is not None and config.run_dir is None:
         config.run_dir = str(saved.path.parent.parent)
     return config
@@ -93,11 +96,9 @@ def build_trainer(config: TrainConfig, saved: Checkpoint | None) -> Trainer:
 
 def report(summary: Summary, run_dir: Path) -> None:
     """Print how the run ended and which files it wrote."""
-    rates = summary.rates
     print(
         f"{summary.reason}: {summary.updates} updates, {summary.samples:,} samples, {summary.seconds / 60:.1f} min\n"
-        f"last updates: hit {100 * rates['hit_rate']:.1f} %, return {100 * rates['success_rate']:.1f} %, "
-        f"falls {rates['fall_rate']:.3f}/s, predictor {rates['predictor_rmse_cm']:.1f} cm\n"
+        f"last updates: {', '.join(rate_texts(summary.rates))}\n"
         f"wrote {summary.checkpoint}\n"
         f"wrote {run_dir / METRICS}" + (f"\nwrote {run_dir / CURVE}" if summary.curve else "")
     )

@@ -144,9 +144,8 @@ class Trainer:
             progress.close()
             self.run.close()
             curve = plot_learning_curve(self.run.path)
-        rates = {n: progress.mean(n) for n in ("hit_rate", "success_rate", "fall_rate", "predictor_rmse_cm")}
         newest = list_checkpoints(self.run.path)[-1]
-        return Summary(reason, self.updates, self.samples, self.wall_s, newest, curve, rates)
+        return Summary(reason, self.updates, self.samples, self.wall_s, newest, curve, progress.rates())
 
     @property
     def _samples_per_update(self) -> int:

@@ -1,0 +1,90 @@
+"""``python -m pace.rl.train`` itself: a short real run, its exact resume, and one line for each kind of wrong input."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from pace.rl.checkpoint import load_checkpoint
+from pace.rl.run_folder import read_metrics
+from pace.rl.train import main
+
+WORLDS = 8
+UPDATE = WORLDS * 12
+SMALL = ("algo.actor_hidden=[32]", "algo.critic_hidden=[32]", "predictor.batches_per_update=2", "progress=false")
+
+
+@pytest.fixture
+def train(monkeypatch: pytest.MonkeyPatch):
+    """Run the command with arguments, in this process; returns its exit status."""
+
+    def run(*arguments: str) -> int:
+        monkeypatch.setattr(sys, "argv", ["train", *arguments])
+        return main()
+
+    return run
+
+
+def real_run(train, path: Path, updates: int, *arguments: str) -> int:
+    return train(f"num_worlds={WORLDS}", f"samples={updates * UPDATE}", f"run_dir={path}", *SMALL, *arguments)
+
+
+def test_real_updates_and_an_exact_resume(train, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert real_run(train, tmp_path / "whole", 4) == 0
+    printed = capsys.readouterr().out
+    assert "4 updates" in printed
+    for name in ("metrics.csv", "learning_curve.png"):
+        assert f"wrote {tmp_path / 'whole' / name}" in printed
+    assert real_run(train, tmp_path / "parts", 2) == 0
+    assert train(f"resume={tmp_path / 'parts'}", f"samples={4 * UPDATE}", "progress=false") == 0
+    whole, parts = load_checkpoint(tmp_path / "whole"), load_checkpoint(tmp_path / "parts")
+    assert parts.counters["updates"] == 4
+    for part, tensors in whole.weights.items():
+        for name, tensor in tensors.items():
+            assert torch.equal(tensor, parts.weights[part][name]), f"{part} {name}"
+    rewards = [read_metrics(tmp_path / run / "metrics.csv")["mean_reward"] for run in ("whole", "parts")]
+    assert rewards[0] == rewards[1]
+    assert len(set(rewards[0])) == 4
+
+
+def test_init_from_starts_anew_with_the_weights(train, tmp_path: Path) -> None:
+    assert real_run(train, tmp_path / "old", 1) == 0
+    assert real_run(train, tmp_path / "new", 1, f"init_from={tmp_path / 'old'}") == 0
+    old, new = load_checkpoint(tmp_path / "old"), load_checkpoint(tmp_path / "new")
+    assert new.counters["updates"] == 1
+    assert new.weights["agent"]["policy_norm.count"].item() == 2 * UPDATE
+    change = new.weights["agent"]["critic.layers.0.weight"] - old.weights["agent"]["critic.layers.0.weight"]
+    assert 0.0 < change.abs().max().item() < 0.1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "words"),
+    [
+        (["no_such_key=1"], 2, "no_such_key"),
+        (["algo=no_such_group"], 2, "algo/no_such_group"),
+        (["num_worlds=0"], 2, "num_worlds must be at least 1"),
+        (["num_worlds=many"], 2, "num_worlds"),
+        (["algo.gamma=2"], 2, "algo.gamma"),
+        (["device=cuda:31"], 2, "cuda:31"),
+        (["resume=no/such/run"], 1, "no/such/run does not exist"),
+        (["init_from=tests"], 1, "neither a run folder nor a checkpoint"),
+        (["resume=a", "init_from=b"], 2, "not both"),
+    ],
+)
+def test_wrong_input_is_one_line(train, capfd: pytest.CaptureFixture[str], arguments, status, words) -> None:
+    assert train(*arguments, "num_worlds=4" if "num_worlds" not in arguments[0] else "progress=false") == status
+    lines = [line for line in capfd.readouterr().err.splitlines() if not line.startswith("Warp")]
+    assert len(lines) == 1
+    assert lines[0].startswith("error: ")
+    assert words in lines[0]
+
+
+def test_a_resumed_run_keeps_its_task(train, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert real_run(train, tmp_path, 1) == 0
+    assert train(f"resume={tmp_path}", "algo.gamma=0.9") == 2
+    assert "'algo.gamma' cannot change in a resumed run" in capsys.readouterr().err
+    assert train(f"resume={tmp_path}", "progress=false") == 2
+    assert "give samples= above that" in capsys.readouterr().err
