@@ -49,8 +49,8 @@ class MjwarpEngine(StateTensors):
     """MuJoCo Warp in float32. See :class:`~pace.sim.engine.RobotEngine`.
 
     On a GPU one control step is one CUDA graph, captured at the first ``advance``. The graph holds the addresses of
-    the arrays and the options of that moment: values are edited in place without a new capture; after replacing an
-    array of ``model`` or ``data``, or an option of ``model.opt``, set ``graph`` to None and the next step captures anew.
+    the arrays and the options of that moment. Values are edited in place without a new capture; after replacing an
+    array of ``model`` or ``data``, or an option, set ``graph`` to None, and the next step captures anew.
     """
 
     def __init__(
@@ -60,12 +60,12 @@ class MjwarpEngine(StateTensors):
         self._warp_device = wp.device_from_torch(device)
         self._fields = ModelFields(model, device)
         with wp.ScopedDevice(self._warp_device):
-            self.model = mjw.put_model(model)
+            self.model = mjw.put_model(model, batch_sizes=dict.fromkeys(ModelFields.NAMES, num_worlds))
             self.model.opt.warn_overflow = 0  # a line a world a step; overflowed() tells
             self.data = mjw.make_data(
                 model, num_worlds, nconmax=engine.contacts_per_world, njmax=engine.constraints_per_world
             )
-        self._model = {name: self._expand(getattr(model, name), name) for name in ModelFields.NAMES}
+        self._model = {name: wp.to_torch(getattr(self.model, name)) for name in ModelFields.NAMES}
         data = self.data
         self._qpos, self._qvel = wp.to_torch(data.qpos), wp.to_torch(data.qvel)
         self._warmstart, self._applied = wp.to_torch(data.qacc_warmstart), wp.to_torch(data.qfrc_applied)
@@ -76,13 +76,6 @@ class MjwarpEngine(StateTensors):
         self._warp_path = [wp.from_torch(self.qpos_path), wp.from_torch(self.qvel_path)]
         self.graph: Any = None
         self._qpos.copy_(self.qpos_path[:, 0])
-
-    def _expand(self, nominal: Any, name: str) -> Tensor:
-        """Give a model field a leading world dimension; return it as a tensor that shares its memory."""
-        values = torch.as_tensor(nominal, dtype=torch.float32, device=self.device)
-        values = values.unsqueeze(0).repeat(self.num_worlds, *[1] * values.dim())
-        setattr(self.model, name, wp.from_torch(values, dtype=getattr(self.model, name).dtype))
-        return values
 
     def advance(self, targets: Tensor, applied: Tensor) -> None:
         self._targets.copy_(targets)

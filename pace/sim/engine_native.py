@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 
 import mujoco
@@ -28,48 +29,52 @@ class NativeEngine(StateTensors):
         if device.type != "cpu":
             raise ConfigError(f"engine native runs on the CPU, not on {device}: use device=cpu or engine=mjwarp")
         super().__init__(model, num_worlds, device, substeps, engine.physics_dt)
-        threads = engine.threads or len(os.sched_getaffinity(0))
-        self._batch = batch = Batch(model, num_worlds, threads)
+        model = copy.copy(model)
+        # a state that is not finite stays so and is seen; MuJoCo would put that robot back on its feet without a word
+        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        self._batch = batch = Batch(model, num_worlds, engine.threads or _usable_cores())
         self._fields = ModelFields(model, device)
-        self._model = {name: torch.from_numpy(batch.expand(name)) for name in ModelFields.NAMES}
-        self._qpos, self._qvel = torch.from_numpy(batch.bind("qpos")), torch.from_numpy(batch.bind("qvel"))
-        self._warmstart = torch.from_numpy(batch.bind("qacc_warmstart"))
+        self._model = {name: batch.expand(name) for name in ModelFields.NAMES}
+        self._qpos, self._qvel = batch.bind("qpos"), batch.bind("qvel")
+        self._warmstart = batch.bind("qacc_warmstart")
         self._control = np.zeros((num_worlds, substeps, model.nu + model.nv))
-        control = torch.from_numpy(self._control)
-        self._targets, self._applied = control[..., : model.nu], control[..., model.nu :]
+        self._targets, self._applied = self._control[..., : model.nu], self._control[..., model.nu :]
         widths = {"qpos": model.nq, "qvel": model.nv, "sensordata": model.nsensordata, "actuator_force": model.nu}
         self._record = {name: np.zeros((num_worlds, substeps, width)) for name, width in widths.items()}
-        recorded = {name: torch.from_numpy(array) for name, array in self._record.items()}
-        self._new_qpos, self._new_qvel = recorded["qpos"], recorded["qvel"]
-        self._sensordata, self._actuator_force = recorded["sensordata"][:, -1], recorded["actuator_force"][:, -1]
-        self._qpos.copy_(self.qpos_path[:, 0])
+        self._sensordata = torch.from_numpy(self._record["sensordata"])[:, -1]
+        self._actuator_force = torch.from_numpy(self._record["actuator_force"])[:, -1]
+        # NumPy copies: torch's would wake its own threads beside the pool's, which costs milliseconds on busy cores
+        self._paths = {"qpos": self.qpos_path.numpy(), "qvel": self.qvel_path.numpy()}
+        self._qpos[:] = self._paths["qpos"][:, 0]
 
     def advance(self, targets: Tensor, applied: Tensor) -> None:
-        self._targets.copy_(targets)
-        self._applied.copy_(applied.unsqueeze(1))
-        self.qpos_path[:, 0].copy_(self._qpos)
-        self.qvel_path[:, 0].copy_(self._qvel)
+        self._targets[:] = targets.numpy()
+        self._applied[:] = applied.numpy()[:, None]
+        self._paths["qpos"][:, 0] = self._qpos
+        self._paths["qvel"][:, 0] = self._qvel
         self._batch.rollout(self.substeps, self._control, _CONTROL, tuple(self._record), out=self._record)
-        self.qpos_path[:, 1:].copy_(self._new_qpos)
-        self.qvel_path[:, 1:].copy_(self._new_qvel)
+        for name, path in self._paths.items():
+            path[:, 1:] = self._record[name]
         self._read_sensors(self._sensordata, self._actuator_force)
 
     def reset(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
-        ids = mask.nonzero().squeeze(-1)
-        for state, path, values in ((self._qpos, self.qpos_path, qpos), (self._qvel, self.qvel_path, qvel)):
-            chosen = values[ids]
-            state[ids] = chosen.double()
-            path[ids] = chosen.unsqueeze(1)
-        for tensor in (self._warmstart, self.foot_force, self.body_contact, self.joint_torque):
-            tensor[ids] = 0.0
+        ids = mask.numpy().nonzero()[0]
+        states = (("qpos", self._qpos, qpos), ("qvel", self._qvel, qvel))
+        for name, state, values in states:
+            chosen = values.numpy()[ids]
+            state[ids] = chosen
+            self._paths[name][ids] = chosen[:, None]
+        self._warmstart[ids] = 0.0
+        for tensor in (self.foot_force, self.body_contact, self.joint_torque):
+            tensor.numpy()[ids] = 0.0
 
     def apply_params(self, mask: Tensor) -> None:
         ids = mask.nonzero().squeeze(-1)
         for name, index, values in self._fields.writes(self.params.rows(ids)):
-            self._model[name][:, *index][ids] = values.to(self._model[name].dtype)
+            self._model[name][:, *index][ids.numpy()] = values.numpy()
 
     def add_velocity(self, delta: Tensor) -> None:
-        self._qvel += delta
+        self._qvel += delta.numpy()
 
     def overflowed(self) -> bool:
         full = [int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_CNSTRFULL)]
@@ -77,8 +82,15 @@ class NativeEngine(StateTensors):
 
     def state_dict(self) -> dict[str, Tensor]:
         state = {"qpos": self._qpos, "qvel": self._qvel, "warmstart": self._warmstart}
-        return state | self._outputs()
+        return {name: torch.from_numpy(array) for name, array in state.items()} | self._outputs()
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         for name, tensor in self.state_dict().items():
             tensor.copy_(state[name])
+
+
+def _usable_cores() -> int:
+    """Cores that this process may use: a job's share of a machine where the system tells, or all of them."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
