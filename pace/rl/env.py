@@ -39,7 +39,7 @@ OWN_TENSORS = (
     "serve_outcome",
     "predictor_target",
     "predictor_time_to_apex",
-    "_bad_term",
+    "_bad",
 )
 
 
@@ -131,7 +131,7 @@ class TableTennisEnv(EnvBase):
         self.terminated, self.truncated = self.task_state.lost, torch.zeros_like(self._everyone)
         self.serve_over, self.serve_hit = torch.zeros_like(self._everyone), torch.zeros_like(self._everyone)
         self.serve_outcome = torch.zeros_like(self.game.referee.outcome)
-        self._bad_term = torch.full((count,), -1, dtype=torch.long, device=device)
+        self._bad = torch.zeros_like(self._everyone)
 
     @property
     def warmup_serves(self) -> int:
@@ -246,30 +246,24 @@ class TableTennisEnv(EnvBase):
     # --- faults, statistics, state ------------------------------------------------------------------------------------
 
     def _flag_bad(self) -> None:
-        """Remember the first value of each world that is not finite: a reward term, or an observation."""
-        terms = self.rewards.values.isfinite().logical_not_()
-        frames = (self._policy_history.frame.sum(1) + self._critic_history.frame.sum(1)).isfinite().logical_not_()
-        found = torch.where(terms.any(0), terms.int().argmax(0), len(self.rewards.names))
-        first = (self._bad_term < 0) & (terms.any(0) | frames)
-        self._bad_term.copy_(torch.where(first, found, self._bad_term))
+        """Remember the worlds in which a reward or an observation is not finite."""
+        total = self.reward + self._policy_history.frame.sum(1) + self._critic_history.frame.sum(1)
+        self._bad.logical_or_(total.isfinite().logical_not_())
 
     def first_bad(self) -> str | None:
         """World and term of a value that was not finite, or None. Waits for the device: ask once an update."""
-        worlds = (self._bad_term >= 0).nonzero()
+        worlds = self._bad.nonzero()
         if worlds.numel() == 0:
             return None
         world = int(worlds[0])
-        term = int(self._bad_term[world])
-        name = f"reward term '{self.rewards.names[term]}'" if term < len(self.rewards.names) else self._bad_name(world)
-        return f"{name} of world {world} is not finite"
-
-    def _bad_name(self, world: int) -> str:
+        terms = self.rewards.values[:, world].isfinite().tolist()
+        bad = [f"reward term '{name}'" for name, finite in zip(self.rewards.names, terms, strict=True) if not finite]
         groups = ((self._policy_history, self.policy_layout), (self._critic_history, self.critic_layout))
         for history, columns in groups:
-            for name, where in columns.items():
-                if not bool(history.frames[world, :, where].isfinite().all()):
-                    return f"observation '{name}'"
-        return "an observation"
+            finite = history.frames[world].isfinite().all(0)
+            bad += [f"observation '{name}'" for name, where in columns.items() if not bool(finite[where].all())]
+        # the fault of an earlier step may have gone from the last values
+        return f"{bad[0] if bad else 'a reward or an observation'} of world {world} is not finite"
 
     def pop_statistics(self) -> dict[str, Tensor]:
         """Sums over worlds and steps since the last call, 0-d tensors: see :class:`pace.rl.statistics.Statistics`;

@@ -1,0 +1,123 @@
+"""Delay and noise of the sensed signals, and the orientation computed from them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from pace.config import SensingConfig
+from pace.sim.sensing import Sensing, base_orientation
+from tests.rl.fakes import CPU, config, fake_robot
+
+DT = 0.02
+NONE = torch.zeros(4, dtype=torch.bool)
+ALL = torch.ones(4, dtype=torch.bool)
+
+
+def make(sensing: SensingConfig, worlds: int = 4) -> Sensing:
+    return Sensing(sensing, worlds, CPU, DT, torch.zeros(21), torch.Generator().manual_seed(0))
+
+
+def clean(low: float, high: float) -> SensingConfig:
+    return replace(config("sensing=clean").sensing, mocap_delay=[low, high])
+
+
+def ball_at(x: float) -> Tensor:
+    return torch.tensor([x, 0.0, 1.0]).repeat(4, 1)
+
+
+def test_clean_sensing_is_the_truth() -> None:
+    sensing, robot = make(clean(0.0, 0.0)), fake_robot(4)
+    robot.joint_velocity.copy_(torch.randn(4, 21))
+    sensing.reset(ALL, robot, ball_at(1.0))
+    sensing.update(robot, ball_at(0.9), NONE)
+    torch.testing.assert_close(sensing.ball_position, ball_at(0.9))
+    for name in ("base_position", "heading", "projected_gravity", "joint_velocity", "base_angular_velocity"):
+        torch.testing.assert_close(getattr(sensing, name), getattr(robot, name))
+
+
+@pytest.mark.parametrize("delay", [0.004, 0.010, 0.020, 0.030, 0.055])
+def test_delays_interpolate_linear_motion_exactly(delay: float) -> None:
+    sensing, robot = make(clean(delay, delay)), fake_robot(4)
+    sensing.reset(ALL, robot, ball_at(1.0))
+    for step in range(1, 8):
+        robot.base_position[:, 0] = -1.8 + 0.01 * step
+        sensing.update(robot, ball_at(1.0 - 0.1 * step), NONE)
+    ago = 7 - delay / DT
+    torch.testing.assert_close(sensing.ball_position, ball_at(1.0 - 0.1 * ago))
+    torch.testing.assert_close(sensing.base_position[:, 0], torch.full((4,), -1.8 + 0.01 * ago))
+
+
+def test_delays_are_drawn_per_world_at_reset() -> None:
+    sensing, robot = make(clean(0.004, 0.010), 2000), fake_robot(2000)
+    everyone = torch.ones(2000, dtype=torch.bool)
+    sensing.reset(everyone, robot, torch.zeros(2000, 3))
+    sensing.update(robot, torch.full((2000, 3), DT), ~everyone)  # moves at 1 m/s: the lag is the delay
+    lag = DT - sensing.ball_position[:, 0]
+    assert 0.004 - 1e-6 <= float(lag.min()) < 0.0041
+    assert 0.0099 < float(lag.max()) <= 0.010 + 1e-6
+    assert float(lag.mean()) == pytest.approx(0.007, abs=1e-4)
+
+
+def test_a_new_ball_is_seen_where_it_is_launched() -> None:
+    sensing, robot = make(clean(0.010, 0.010)), fake_robot(4)
+    sensing.reset(ALL, robot, ball_at(-2.0))
+    robot.base_position[:, 0] += 0.1
+    launched = torch.tensor([True, False, True, False])
+    sensing.update(robot, ball_at(1.35), launched)
+    torch.testing.assert_close(sensing.ball_position[:, 0], torch.tensor([1.35, -0.325, 1.35, -0.325]))
+    torch.testing.assert_close(sensing.base_position[:, 0], torch.full((4,), -1.75))  # the base did not jump
+
+
+def test_noise_is_uniform_with_the_configured_amplitude() -> None:
+    sensing, robot = make(config("sensing=paper").sensing, 4000), fake_robot(4000)
+    everyone = torch.ones(4000, dtype=torch.bool)
+    sensing.reset(everyone, robot, torch.zeros(4000, 3))
+    amplitudes = {
+        "base_angular_velocity": 0.2, "base_position": 0.007, "projected_gravity": 0.05, "joint_position": 0.01,
+        "joint_velocity": 1.5, "ball_position": 0.007, "heading": 0.05,
+    }  # fmt: skip
+    truth = vars(robot) | {"ball_position": torch.zeros(4000, 3)}
+    for name, amplitude in amplitudes.items():
+        error = getattr(sensing, name) - truth[name]
+        assert float(error.abs().max()) <= amplitude * 1.0001, name
+        assert float(error.std()) == pytest.approx(amplitude / math.sqrt(3), rel=0.03), name
+        assert float(error.mean()) == pytest.approx(0.0, abs=0.03 * amplitude), name
+    assert float(sensing.base_shift_noise.abs().max()) <= 0.007
+
+
+def test_reset_changes_only_masked_worlds() -> None:
+    sensing, robot = make(config("sensing=paper").sensing), fake_robot(4)
+    sensing.reset(ALL, robot, ball_at(1.0))
+    before = sensing._sensed.clone()
+    mask = torch.tensor([False, True, False, False])
+    sensing.reset(mask, robot, ball_at(1.3))
+    assert torch.equal(sensing._sensed[~mask], before[~mask])
+    assert not torch.equal(sensing._sensed[mask], before[mask])
+
+
+@pytest.mark.parametrize(("roll", "pitch", "yaw"), [(0.0, 0.0, 0.0), (0.3, -0.2, 0.7), (-0.1, 0.4, -2.5)])
+def test_orientation_from_gravity_and_heading(roll: float, pitch: float, yaw: float) -> None:
+    def axis(angle: float, index: int) -> list[float]:
+        quat = [math.cos(angle / 2), 0.0, 0.0, 0.0]
+        quat[index] = math.sin(angle / 2)
+        return quat
+
+    def product(a: list[float], b: list[float]) -> list[float]:
+        w, x, y, z = a
+        q, i, j, k = b
+        return [
+            w * q - x * i - y * j - z * k, w * i + x * q + y * k - z * j,
+            w * j - x * k + y * q + z * i, w * k + x * j - y * i + z * q,
+        ]  # fmt: skip
+
+    expected = product(product(axis(yaw, 3), axis(pitch, 2)), axis(roll, 1))
+    w, x, y, z = expected
+    gravity = torch.tensor([[2 * (w * y - x * z), -2 * (y * z + w * x), 2 * (x * x + y * y) - 1]])
+    heading = torch.tensor([[1 - 2 * (y * y + z * z), 2 * (x * y + w * z)]])
+    quat = base_orientation(1.3 * gravity, 0.8 * heading)
+    torch.testing.assert_close(quat, torch.tensor([expected]), atol=1e-6, rtol=0)
