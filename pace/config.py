@@ -429,7 +429,7 @@ class PaperRow:
 class VariationConfig:
     """Values of each change of ``python -m pace.rl.evaluate --sweep``, one change at a time."""
 
-    ball: list[str]  # presets
+    ball: list[str]  # presets; []: all of configs/ball/
     engine: list[str]
     noise: list[float]  # times the sensing noise
     latency: list[float]  # s added to the delay of motion capture
@@ -497,9 +497,15 @@ def compose(config_name: str, overrides: list[str] | None = None) -> DictConfig:
     """Compose ``configs/<config_name>.yaml`` with Hydra overrides, for tests, notebooks and rebuilt runs."""
     from hydra import compose as hydra_compose
     from hydra import initialize_config_dir
+    from hydra.core.global_hydra import GlobalHydra
 
-    with initialize_config_dir(config_dir=str(config_dir()), version_base="1.3"):
-        return hydra_compose(config_name=config_name, overrides=overrides or [])
+    outer = GlobalHydra.instance().hydra  # set while a command runs, which may compose other configurations
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(config_dir=str(config_dir()), version_base="1.3"):
+            return hydra_compose(config_name=config_name, overrides=overrides or [])
+    finally:
+        GlobalHydra.instance().hydra = outer
 
 
 def load_train_config(overrides: list[str] | None = None) -> TrainConfig:

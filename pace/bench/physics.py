@@ -1,0 +1,112 @@
+"""Control steps a second: MuJoCo alone on all cores, and the whole environment on either engine."""
+
+from __future__ import annotations
+
+import copy
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+
+import mujoco
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pace.bench.timing import median_seconds
+from pace.config import BenchConfig
+from pace.predictor.network import PredictorNetwork
+from pace.rl.env import TableTennisEnv
+
+
+class EnvironmentLoop:
+    """The whole environment on one engine, under random actions that are held for ``control_steps``."""
+
+    def __init__(self, config: BenchConfig, engine: str, device: torch.device, control_steps: int) -> None:
+        config = copy.deepcopy(config)
+        config.engine.name = engine
+        self.control_steps, self.action_std = control_steps, config.bench.action_std
+        predictor = PredictorNetwork(config.predictor).to(device)
+        self.env = TableTennisEnv(config, config.num_worlds, device, config.seed, predictor)
+        self.action = torch.zeros(config.num_worlds, self.env.action_spec.shape[-1], device=device)
+        self.draw()
+
+    def draw(self) -> None:
+        """New actions for every world."""
+        self.action.normal_().mul_(self.action_std)
+
+    def play(self, steps: int) -> None:
+        """Advance all worlds and reset those that are done, ``steps`` times."""
+        for _ in range(steps):
+            self.env.advance(self.action)
+            self.env.reset_worlds(self.env.terminated | self.env.truncated)
+
+    def run(self) -> None:
+        """One measured repeat."""
+        self.play(self.control_steps)
+
+
+class RawMujoco:
+    """``mj_step`` and nothing else: one thread a core, each with its own MjData, taking the worlds one by one.
+
+    Every world is stepped through all its control steps by one C call, so neither Python nor the cache of another
+    world costs anything: this is the limit, not a usable loop.
+    """
+
+    def __init__(self, model: mujoco.MjModel, physics_steps: int) -> None:
+        self.model, self.physics_steps = model, physics_steps
+        self.threads = os.cpu_count() or 1
+        self._data = [mujoco.MjData(model) for _ in range(self.threads)]
+        self._pool = ThreadPoolExecutor(self.threads)
+        self.qpos = self.qvel = self.ctrl = np.zeros((0, 0))
+
+    def start_from(self, qpos: Tensor, qvel: Tensor, ctrl: Tensor) -> None:
+        """States (N, nq), (N, nv) and joint targets (N, nu) rad that every :meth:`run` begins with."""
+        self.qpos, self.qvel, self.ctrl = (_double(values) for values in (qpos, qvel, ctrl))
+
+    def run(self) -> None:
+        """Step all worlds ``physics_steps`` times."""
+        worlds = iter(range(len(self.qpos)))  # shared: taking the next one is atomic
+        for _ in self._pool.map(lambda data: self._step_worlds(data, worlds), self._data):
+            pass
+
+    def _step_worlds(self, data: mujoco.MjData, worlds: Iterator[int]) -> None:
+        for world in worlds:
+            data.qpos[:], data.qvel[:], data.ctrl[:] = self.qpos[world], self.qvel[world], self.ctrl[world]
+            data.qacc_warmstart[:] = 0.0
+            mujoco.mj_step(self.model, data, self.physics_steps)
+
+
+def _double(values: Tensor) -> NDArray[np.float64]:
+    return values.cpu().double().numpy().copy()
+
+
+def native_rates(config: BenchConfig) -> dict[str, float]:
+    """Raw MuJoCo and the native environment by turns, from the same states, with the same held joint targets."""
+    steps, cpu = config.bench.control_steps, torch.device("cpu")
+    loop = EnvironmentLoop(config, "native", cpu, steps)
+    worlds = loop.env.worlds
+    raw = RawMujoco(worlds.model, steps * config.substeps)
+    loop.play(config.bench.settle_steps)
+
+    def same_start() -> None:
+        loop.draw()
+        qpos, qvel = worlds.engine.qpos_path[:, -1], worlds.engine.qvel_path[:, -1]
+        raw.start_from(qpos, qvel, worlds.nominal + config.robot.action_scale * loop.action)
+
+    seconds = median_seconds({"raw": raw.run, "native": loop.run}, config.bench.repeats, cpu, same_start)
+    samples = config.num_worlds * steps
+    return {
+        "raw_mujoco_steps_per_s": samples / seconds["raw"],
+        "native_env_steps_per_s": samples / seconds["native"],
+    }
+
+
+def mjwarp_rates(config: BenchConfig, device: torch.device) -> dict[str, float]:
+    """The whole environment on MuJoCo Warp, on ``device``."""
+    steps = config.bench.mjwarp_steps
+    loop = EnvironmentLoop(config, "mjwarp", device, steps)
+    if device.type == "cuda":
+        loop.play(config.bench.settle_steps)
+    seconds = median_seconds({"mjwarp": loop.run}, config.bench.repeats, device, loop.draw)
+    return {"mjwarp_env_steps_per_s": config.num_worlds * steps / seconds["mjwarp"]}

@@ -1,0 +1,90 @@
+"""The figures as one table and as JSON, each beside the figure that it is to be judged by."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+from pathlib import Path
+from typing import Any
+
+import torch
+
+FILE = "bench.json"
+
+# name: what it is, its unit, and the figures that it is compared with
+FIGURES: dict[str, tuple[str, str, tuple[str, ...]]] = {
+    "raw_mujoco_steps_per_s": ("mj_step alone, all cores", "steps/s", ()),
+    "native_env_steps_per_s": ("environment, native engine", "steps/s", ("raw_mujoco_steps_per_s",)),
+    "mjwarp_env_steps_per_s": ("environment, MuJoCo Warp", "steps/s", ("native_env_steps_per_s",)),
+    "ppo_fp32_samples_per_s": ("PPO update, fp32", "samples/s a pass", ("rsl_rl_fp32_samples_per_s",)),
+    "rsl_rl_fp32_samples_per_s": ("rsl_rl's update, fp32", "samples/s a pass", ()),
+    "ppo_bf16_samples_per_s": (
+        "PPO update, bf16",
+        "samples/s a pass",
+        ("rsl_rl_bf16_samples_per_s", "matmul_bf16_samples_per_s"),
+    ),
+    "rsl_rl_bf16_samples_per_s": ("rsl_rl's update, mixed", "samples/s a pass", ()),
+    "matmul_bf16_samples_per_s": ("its matrix products alone, bf16", "samples/s a pass", ()),
+    "train_steps_per_s": ("training loop, default", "steps/s", ("raw_mujoco_steps_per_s",)),
+    "train_paper_steps_per_s": ("training loop, paper's networks", "steps/s", ("train_steps_per_s",)),
+    "peak_memory_mib": ("peak memory of training", "MiB", ()),
+    "peak_memory_4x_mib": ("the same, four times the worlds", "MiB", ()),
+}
+
+
+def ratios(figures: dict[str, float | None]) -> dict[str, float]:
+    """``name/base``: quotient, for every pair of ``FIGURES`` that was measured."""
+    found: dict[str, float] = {}
+    for name, (_, _, bases) in FIGURES.items():
+        for base in bases:
+            value, reference = figures.get(name), figures.get(base)
+            if value is not None and reference is not None:
+                found[f"{name}/{base}"] = value / reference
+    return found
+
+
+def table(figures: dict[str, float | None]) -> str:
+    """One line a figure: what it is, its value, and how it compares."""
+    quotients = ratios(figures)
+    lines = []
+    for name, (title, unit, bases) in FIGURES.items():
+        value = figures.get(name)
+        if value is None:
+            continue
+        shares = [f"{quotients[f'{name}/{b}']:.2f} x {FIGURES[b][0]}" for b in bases if f"{name}/{b}" in quotients]
+        lines.append(f"{title:<34}{value:>10,.0f} {unit:<18}{'; '.join(shares)}".rstrip())
+    return "\n".join(lines)
+
+
+def complete(figures: dict[str, float]) -> dict[str, float | None]:
+    """All names of ``FIGURES``; None for what was not measured."""
+    return {name: None if math.isnan(figures.get(name, math.nan)) else figures[name] for name in FIGURES}
+
+
+def machine(device: torch.device) -> dict[str, Any]:
+    """What the figures were measured on. ``load`` is the machine's load average before the first measurement."""
+    gpu = torch.cuda.get_device_name(device) if device.type == "cuda" else None
+    return {
+        "cpu": _cpu_name(),
+        "cores": os.cpu_count(),
+        "gpu": gpu,
+        "torch_threads": torch.get_num_threads(),
+        "load": os.getloadavg()[0],
+    }
+
+
+def _cpu_name() -> str:
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        for line in info.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()
+
+
+def write(path: Path, figures: dict[str, float | None], context: dict[str, Any]) -> None:
+    """``bench.json``: the figures by name, their ratios, and the circumstances."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps({**figures, "ratios": ratios(figures), **context}, indent=1) + "\n")

@@ -1,0 +1,84 @@
+"""The whole training loop, as the command that users run: control steps a second and peak memory."""
+
+from __future__ import annotations
+
+import csv
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from pace.config import BenchConfig, load_train_config
+from pace.rl.run_folder import METRICS
+
+WARM_UP_ROWS = 2  # updates that do not count: compilation, allocation
+PAPER_NETWORKS = {"algo": "paper", "observation": "paper"}  # default physics and task, the paper's networks and critic
+
+
+class BenchError(RuntimeError):
+    """A measured command failed; the message holds the end of what it printed."""
+
+
+def without(overrides: list[str], *keys: str) -> list[str]:
+    """The Hydra overrides that set none of ``keys``."""
+    return [override for override in overrides if override.lstrip("+~").split("=")[0] not in keys]
+
+
+def train_rates(config: BenchConfig, overrides: list[str]) -> dict[str, float]:
+    """Training with the default recipe and with the paper's networks; peak memory of the former."""
+    updates = config.bench.train_updates
+    rate, memory = training_run(config.num_worlds, updates, overrides)
+    paper = [*without(overrides, *PAPER_NETWORKS), *(f"{key}={value}" for key, value in PAPER_NETWORKS.items())]
+    paper_rate, _ = training_run(config.num_worlds, updates, paper)
+    return {"train_steps_per_s": rate, "train_paper_steps_per_s": paper_rate, "peak_memory_mib": memory}
+
+
+def memory_peak(config: BenchConfig, overrides: list[str]) -> dict[str, float]:
+    """Peak memory with four times the worlds."""
+    _, memory = training_run(4 * config.num_worlds, config.bench.memory_updates, overrides)
+    return {"peak_memory_4x_mib": memory}
+
+
+def training_run(num_worlds: int, updates: int, overrides: list[str]) -> tuple[float, float]:
+    """Train for ``updates`` in a process of its own.
+
+    Returns its control steps a second after the first updates (NaN for a run that is too short), and the largest
+    resident memory of the process in MiB. Errors: :class:`BenchError` when the command fails.
+    """
+    kept = without(overrides, "num_worlds", "samples", "minutes", "run_dir", "progress", "tensorboard")
+    steps = load_train_config(kept).algo.steps
+    with tempfile.TemporaryDirectory() as folder:
+        settings = {
+            "num_worlds": num_worlds,
+            "samples": updates * num_worlds * steps,
+            "minutes": 0,
+            "progress": "false",
+            "tensorboard": "false",
+            "run_dir": folder,
+        }
+        command = [sys.executable, "-m", "pace.rl.train", *kept, *(f"{k}={v}" for k, v in settings.items())]
+        memory = _peak_mib(command, Path(folder) / "output.txt")
+        return steady_rate(Path(folder) / METRICS), memory
+
+
+def _peak_mib(command: list[str], output: Path) -> float:
+    with output.open("w") as file:
+        process = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT)
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode != 0:
+        tail = "\n".join(output.read_text().splitlines()[-15:])
+        raise BenchError(f"{' '.join(command)} ended with status {process.returncode}:\n{tail}")
+    unit = 1 if sys.platform == "darwin" else 1024  # bytes there, KiB elsewhere
+    return usage.ru_maxrss * unit / 2**20
+
+
+def steady_rate(metrics: Path) -> float:
+    """Control steps a second in a run's metrics after its first updates; NaN where there are no more."""
+    with metrics.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    if len(rows) <= WARM_UP_ROWS:
+        return float("nan")
+    first, last = rows[WARM_UP_ROWS - 1], rows[-1]
+    return (float(last["samples"]) - float(first["samples"])) / (float(last["wall_s"]) - float(first["wall_s"]))
