@@ -89,6 +89,9 @@ class MjwarpEngine(StateTensors):
         self._read_sensors(self._sensordata, self._actuator_force)
 
     def _capture(self) -> None:
+        saved = {name: value.clone() for name, value in self.state_dict().items()}
+        self._play()  # compiles its kernels, which may fail inside a capture
+        self.load_state_dict(saved)
         with wp.ScopedDevice(self._warp_device), wp.ScopedCapture() as capture:
             self._play()
         self.graph = capture.graph
