@@ -6,12 +6,17 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from pace.rl.env import TableTennisEnv, make_env
+    from pace.rl.loading import load_policy
 
-__all__ = ["TableTennisEnv", "make_env"]
+__all__ = ["TableTennisEnv", "load_policy", "make_env"]
 
 
 def __getattr__(name: str) -> Any:
     """Import on first use, so that ``import pace.rl`` stays light."""
+    if name == "load_policy":
+        from pace.rl.loading import load_policy
+
+        return load_policy
     if name in __all__:
         from pace.rl import env
 
