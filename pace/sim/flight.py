@@ -317,13 +317,15 @@ def grazing_time(surface: int, arc: Arc, radius: float, scene: Scene, world: int
 
 
 @wp.func
-def touching_contact(surface: int, arc: Arc, radius: float, scene: Scene, world: int) -> Contact:
-    """Contact on an arc that begins on the surface, or inside it, and ends inside it."""
+def touching_contact(surface: int, arc: Arc, gap: float, radius: float, scene: Scene, world: int) -> Contact:
+    """Contact on an arc that begins on the surface, or inside it, at ``gap`` (m), and ends inside it."""
     contact = Contact()
     contact.surface = surface
     before = gap_rate(surface, arc, 0.0, radius, scene, world)
     if before < -REST_SPEED:
-        return contact  # struck at once
+        if gap > 0.0:
+            contact.time = closing_time(surface, arc, arc.duration, radius, scene, world)
+        return contact  # a paddle that closes in on a ball inside it strikes at once
     if gap_rate(surface, arc, arc.duration, radius, scene, world) >= 0.0:
         contact.surface = NOTHING  # still inside, but on its way out
         return contact
@@ -343,7 +345,7 @@ def contact_with(
     contact.surface = NOTHING
     if gap <= TOUCH:
         if end_gap < 0.0:
-            return touching_contact(surface, arc, radius, scene, world)
+            return touching_contact(surface, arc, gap, radius, scene, world)
         return contact
     time = wp.float32(_NEVER)
     if end_gap < 0.0:
