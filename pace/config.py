@@ -444,7 +444,7 @@ class VariationConfig:
 
 @dataclass
 class EvaluateConfig:
-    """``python -m pace.rl.evaluate``: which policy, on what task, how many serves. ``None`` keeps what was saved."""
+    """``python -m pace.rl.evaluate``: which policy, on what task, how many serves."""
 
     run: str | None
     policy: str  # run, zero, random
@@ -454,12 +454,8 @@ class EvaluateConfig:
     num_worlds: int
     device: str
     seed: int
-    engine: str | None
     physics_dt: float  # s
-    ball: str | None
-    randomization: str | None
-    sensing: str | None
-    overrides: list[str]
+    overrides: list[str]  # of the saved task
     out: str | None
     progress: bool
     sweep: bool

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 #: Groups of configs/ that may be chosen anew for a saved policy; networks and observations may not.
 TASK_GROUPS = ("ball", "serve", "reset", "randomization", "sensing", "reward")
+#: Parts of a saved task of which single values may be changed.
+CHANGEABLE = (*TASK_GROUPS, "engine", "robot")
 RANDOM_STD = 0.8  # of the random policy's actions: how widely a training run begins to explore
 
 
@@ -178,7 +180,7 @@ def override_task(config: TrainConfig, overrides: Sequence[str]) -> TrainConfig:
             choices[key] = choice
         elif key == "engine":
             values.append(f"engine.name={choice}")
-        elif key.split(".")[0] in (*TASK_GROUPS, "engine", "robot"):
+        elif key.split(".")[0] in CHANGEABLE:
             values.append(override)
         else:
             raise ConfigError(f"'{key}' cannot change for a saved policy; {', '.join(TASK_GROUPS)} and engine can")
