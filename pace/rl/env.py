@@ -16,7 +16,6 @@ from pace.rl.observations import (
     CRITIC,
     POLICY,
     ActorSignals,
-    CriticSignals,
     History,
     Predictor,
     check_critic,
@@ -26,21 +25,13 @@ from pace.rl.observations import (
 from pace.rl.rewards import RewardManager
 from pace.rl.state import TaskState
 from pace.rl.statistics import Statistics
-from pace.rl.task import Game, PoseSampler, ServeSampler, lost_position
+from pace.rl.task import Game, PoseSampler, ServeSampler
 from pace.sim.sensing import Sensing
 from pace.sim.snapshot import restore, snapshot, under_prefix, with_prefix
 from pace.sim.worlds import Worlds
 
 #: The environment's own part of its state; the rest belongs to its parts.
-OWN_TENSORS = (
-    "truncated",
-    "serve_over",
-    "serve_hit",
-    "serve_outcome",
-    "predictor_target",
-    "predictor_time_to_apex",
-    "_bad",
-)
+OWN_TENSORS = ("predictor_target", "predictor_time_to_apex", "_bad")
 
 
 class TableTennisEnv(EnvBase):
@@ -100,17 +91,16 @@ class TableTennisEnv(EnvBase):
         self._poses = PoseSampler(
             config.reset, config.robot, worlds.nominal, limits, worlds.joint_names, self.generator
         )
-        self.game = Game(config.serve, reward, self.num_worlds, device)
-        self.task_state = TaskState(worlds, self.game, reward)
+        self.game = Game(config, worlds.ball, worlds.robot.base_position)
+        self.task_state = TaskState(worlds, self.game)
         self.rewards = RewardManager(reward, self.num_worlds, device, worlds.control_dt)
         self.sensing = Sensing(
             config.sensing, self.num_worlds, device, worlds.control_dt, worlds.nominal, self.generator
         )
-        idle_point = self.game.target.idle_point
+        rule, rules, action = reward.nothing_to_hit, self.game.rules, self.task_state.action
         self.actor = ActorSignals(
-            self.sensing, worlds.kinematics, worlds.nominal, predictor, reward, config.predictor, idle_point
+            self.sensing, worlds.kinematics, worlds.nominal, action, predictor, config.predictor, rule, rules
         )
-        self.critic = CriticSignals(self.task_state, reward)
         self.statistics = Statistics(self.num_worlds, device)
 
     def _allocate(self) -> None:
@@ -128,9 +118,9 @@ class TableTennisEnv(EnvBase):
         self.predictor_valid = self.task_state.something_to_hit
         self.predictor_time_to_apex = torch.zeros(count, device=device)
         self._everyone = torch.ones(count, dtype=torch.bool, device=device)
-        self.terminated, self.truncated = self.task_state.lost, torch.zeros_like(self._everyone)
-        self.serve_over, self.serve_hit = torch.zeros_like(self._everyone), torch.zeros_like(self._everyone)
-        self.serve_outcome = torch.zeros_like(self.game.referee.outcome)
+        ends = self.game.ends
+        self.terminated, self.truncated = ends.lost, ends.truncated
+        self.serve_over, self.serve_outcome, self.serve_hit = ends.over, ends.outcome, ends.hit
         self._bad = torch.zeros_like(self._everyone)
 
     @property
@@ -160,7 +150,7 @@ class TableTennisEnv(EnvBase):
         self._judge()
         self.task_state.refresh()
         self.rewards.compute(self.task_state)
-        next_serve = self.serve_over & ~self.terminated
+        next_serve = self.game.ends.next_serve
         self.statistics.add(self)
         self.game.clock.finish(self.serve_over)
         self._start_serves(next_serve)
@@ -184,12 +174,11 @@ class TableTennisEnv(EnvBase):
         self.worlds.reset_robot(mask, qpos, qvel)
         self.game.clock.start_episode(mask, self.generator)
         self._start_serves(mask)
-        for history in (self.task_state.action, self.task_state.previous_action, self.actor.action):
-            history.masked_fill_(mask.unsqueeze(-1), 0.0)
+        for action in (self.task_state.action, self.task_state.previous_action):
+            action.masked_fill_(mask.unsqueeze(-1), 0.0)
         self.sensing.reset(mask, self.worlds.robot, self.worlds.ball.position)
         self.actor.track.restart(mask, self.sensing.ball_position)
-        self.task_state.refresh()
-        self._compute_signals()
+        self._compute_signals(mask)
         self._policy_history.fill(mask, self._policy_signals())
         self._critic_history.fill(mask, self._critic_signals())
 
@@ -197,41 +186,26 @@ class TableTennisEnv(EnvBase):
         robot, state = self.config.robot, self.task_state
         state.previous_action.copy_(state.action)
         torch.clamp(action, -robot.action_clip, robot.action_clip, out=state.action)
-        self.actor.action.copy_(state.action)
         self.worlds.step(torch.add(self.worlds.nominal, state.action, alpha=robot.action_scale))
 
     def _judge(self) -> None:
         """Referee, forecast of the returns, ends of serves and episodes."""
-        ball, game, clock = self.worlds.ball, self.game, self.game.clock
-        events = ball.events
-        game.referee.judge(events, clock.time, ball.position[:, 0])
-        clock.time += self.worlds.control_dt
-        hits = game.referee.hit_now
-        ball.forecast(
-            hits, events.hit_position, events.hit_velocity_out, events.hit_spin_out, self.config.reward.target_x
-        )
-        game.returns.take(hits, ball.forecast_result)
-        distance = ball.nearest_paddle_distance - ball.params.radius
-        game.closeness.update(game.referee, distance, clock.time >= game.target.time)
-        over = clock.over(ball.position[:, 2], events.floor, game.referee.touch_time)
-        self.terminated.copy_(lost_position(self.worlds.robot.base_position, self.config.reset))
-        game.referee.close(over, self.terminated, game.returns)
-        torch.logical_or(over, self.terminated, out=self.serve_over)
-        self.serve_outcome.copy_(game.referee.outcome)
-        self.serve_hit.copy_(game.referee.hit)
-        torch.logical_and(over & clock.last_serve(), ~self.terminated, out=self.truncated)
+        ball, events, game = self.worlds.ball, self.worlds.ball.events, self.game
+        game.judge()
+        struck = (events.hit_position, events.hit_velocity_out, events.hit_spin_out)
+        ball.forecast(game.referee.hit_now, *struck, self.config.reward.target_x)
+        game.close()
 
     def _start_serves(self, mask: Tensor) -> None:
         ball = self.worlds.ball
         self.worlds.serve(mask, *self._serves.sample(self.num_worlds))
         ball.forecast(mask, ball.position, ball.velocity, ball.spin, self.config.reward.target_x)
-        self.game.start_serve(mask, ball.forecast_result)
+        self.game.start_serve(mask)
 
-    def _compute_signals(self) -> None:
+    def _compute_signals(self, changed: Tensor | None = None) -> None:
         """What both networks see, and what the predictor is taught, from the current state."""
-        self.task_state.refresh_target()
-        self.actor.compute()
-        self.critic.compute()
+        self.task_state.derive()
+        self.actor.compute(changed)
         target, now = self.game.target, self.game.clock.time
         torch.sub(target.apex_time, now, out=self.predictor_time_to_apex)
         truth = {"apex": target.apex, "target": target.point, "target_time": (target.time - now).unsqueeze(-1)}
@@ -241,7 +215,7 @@ class TableTennisEnv(EnvBase):
         return [POLICY[name].function(self.actor) for name in self.config.observation.policy]
 
     def _critic_signals(self) -> list[Tensor]:
-        return [CRITIC[name].function(self.critic) for name in self.config.observation.critic]
+        return [CRITIC[name].function(self.task_state) for name in self.config.observation.critic]
 
     # --- faults, statistics, state ------------------------------------------------------------------------------------
 

@@ -1,8 +1,8 @@
 """Observations of actor and critic: two tables from name to (size, function), and their histories.
 
 The functions of :data:`POLICY` take :class:`ActorSignals`, which holds nothing but sensed signals and what the robot
-can compute from them; those of :data:`CRITIC` take :class:`CriticSignals`, the true state. So the actor cannot see
-the truth by accident: a privileged name in the policy's list is a configuration error.
+can compute from them; those of :data:`CRITIC` take :class:`TaskState`, the truth. So the actor cannot see the
+truth by accident: a privileged name in the policy's list is a configuration error.
 
 A group's observation (N, H * D) is its last H frames of D numbers, oldest first. At reset of a world all H frames are
 the current one.
@@ -15,17 +15,18 @@ from itertools import accumulate
 from typing import NamedTuple, Protocol
 
 import torch
+import warp as wp
 from torch import Tensor
 
-from pace.config import ConfigError, PredictorConfig, RewardConfig
+from pace.config import ConfigError, PredictorConfig
 from pace.predictor.network import OUTPUT_SIZES
+from pace.rl.signal_kernels import PredictionLayout, follow_ball, read_prediction
 from pace.rl.state import TaskState
-from pace.rl.task import clamp_x, nothing_to_hit
-from pace.sim.sensing import Sensing, base_orientation
+from pace.rl.task_kernels import Rules
+from pace.sim.sensing import Sensing
+from pace.sim.sharing import record, share
 
 JOINTS = 21
-#: Times further ahead than this are as good as none, s.
-LONGEST_TIME = 2.0
 
 
 class PaddlePose(Protocol):
@@ -50,28 +51,37 @@ class BallTrack:
     def __init__(self, frames: int, rule: Mapping[str, float], num_worlds: int, device: torch.device) -> None:
         if frames < 3:
             raise ConfigError(f"predictor.frames must be at least 3, got {frames}: the ball's velocity is seen over 3")
-        self._rule = rule
+        self._rules = Rules()
+        for name, value in rule.items():
+            setattr(self._rules, name, value)
         self.positions = torch.zeros(num_worlds, 3 * frames, device=device)
         self.turned = torch.zeros(num_worlds, dtype=torch.bool, device=device)
         self.something_to_hit = torch.zeros(num_worlds, dtype=torch.bool, device=device)
-        self._frames = frames
+        self._mask = torch.zeros(num_worlds, dtype=torch.bool, device=device)
+        self._sensed: Tensor | None = None
 
     def update(self, sensed: Tensor, new_ball: Tensor) -> None:
         """One control step later: ``sensed`` (N, 3) m; ``new_ball`` (N,) bool marks balls just launched."""
-        moved = torch.cat((self.positions[:, 3:], sensed), dim=1)
-        self._set(torch.where(new_ball.unsqueeze(-1), sensed.repeat(1, self._frames), moved), new_ball)
+        self._prepare(sensed, new_ball)
+        self._update()
 
     def restart(self, mask: Tensor, sensed: Tensor) -> None:
         """A new ball at ``sensed`` (N, 3) in the worlds of ``mask`` (N,) bool; the others stay as they are."""
-        first = sensed.repeat(1, self._frames)
-        self._set(torch.where(mask.unsqueeze(-1), first, self.positions), mask)
+        self._prepare(sensed, mask)
+        self._restart()
 
-    def _set(self, positions: Tensor, new_ball: Tensor) -> None:
-        self.positions.copy_(positions)
-        change = positions[:, -3:] - positions[:, -9:-6]  # over two steps: noise matters less; only its sign is used
-        self.turned.copy_((self.turned & ~new_ball) | (change[:, 0] > 0.0))
-        closed = nothing_to_hit(positions[:, -3:], change, self._rule)
-        torch.logical_not(closed | self.turned, out=self.something_to_hit)
+    def _prepare(self, sensed: Tensor, mask: Tensor) -> None:
+        self._mask.copy_(mask)
+        if sensed is not self._sensed:
+            self._bind(sensed)
+
+    def _bind(self, sensed: Tensor) -> None:
+        self._sensed = sensed
+        count, device = self.positions.shape[0], self.positions.device
+        own = [wp.from_torch(tensor) for tensor in (self.positions, self.turned, self.something_to_hit)]
+        shared = [share(sensed), *own, self._rules]
+        self._update = record(follow_ball, count, [share(self._mask), 1, *shared], device)
+        self._restart = record(follow_ball, count, [share(self._mask), 0, *shared], device)
 
 
 class ActorSignals:
@@ -83,6 +93,16 @@ class ActorSignals:
     Attributes, besides ``sensing`` and ``track``: ``action`` (N, J) the previous action, ``apex``, ``target``
     (N, 3) m predicted, ``time`` (N,) s until the ball is at the target, ``shift`` (N, 2) m from the sensed base to
     where it should stand, ``paddle_position`` (N, 3) m, ``paddle_normal`` (N, 3), ``prediction`` (N, P) raw output.
+
+    Args:
+        sensing: the robot's sensors.
+        kinematics: forward kinematics of the paddle.
+        nominal: (J,) rad.
+        action: (N, J) the robot's own last action, kept up to date by its owner.
+        predictor: callable (N, 3 * frames) -> (N, P), or ``None``.
+        config: which outputs the predictor has, and whether it is used.
+        rule: numbers of ``reward.nothing_to_hit``.
+        rules: where to stand, in the kernels' form.
     """
 
     def __init__(
@@ -90,56 +110,59 @@ class ActorSignals:
         sensing: Sensing,
         kinematics: PaddlePose,
         nominal: Tensor,
+        action: Tensor,
         predictor: Predictor | None,
-        reward: RewardConfig,
         config: PredictorConfig,
-        idle_point: Tensor,
+        rule: Mapping[str, float],
+        rules: Rules,
     ) -> None:
-        num_worlds, device = sensing.base_position.shape[0], sensing.base_position.device
-        self.sensing = sensing
-        self.track = BallTrack(config.frames, reward.nothing_to_hit, num_worlds, device)
-        self._kinematics, self._nominal, self._idle_point = kinematics, nominal, idle_point
+        num_worlds, device = action.shape[0], action.device
+        self.sensing, self.action = sensing, action
+        self.track = BallTrack(config.frames, rule, num_worlds, device)
         self.predictor = predictor if config.enabled else None
-        self._slices = predictor_slices(config.outputs)
-        self._target_x, self._intercept = reward.target_x, reward.target_mode == "intercept"
-        self._arm_offset = torch.tensor(reward.arm_offset, device=device)
-        self._idle_base = torch.tensor(reward.idle_base_xy, device=device)
-        self.action = torch.zeros(num_worlds, nominal.shape[0], device=device)
+        self._kinematics, self._nominal = kinematics, nominal
+        self._joints = torch.zeros_like(action)
         self.prediction = torch.zeros(num_worlds, sum(OUTPUT_SIZES[name] for name in config.outputs), device=device)
         self.apex, self.target = torch.zeros(num_worlds, 3, device=device), torch.zeros(num_worlds, 3, device=device)
         self.time = torch.zeros(num_worlds, device=device)
         self.shift = torch.zeros(num_worlds, 2, device=device)
         self.paddle_position = torch.zeros(num_worlds, 3, device=device)
         self.paddle_normal = torch.zeros(num_worlds, 3, device=device)
+        self._read = self._record(predictor_slices(config.outputs), rules)
 
-    def compute(self) -> None:
-        """Everything that follows from the current ``sensing``, ``track`` and ``action``."""
+    def _record(self, slices: dict[str, slice], rules: Rules) -> Callable[[], None]:
+        columns = PredictionLayout()
+        columns.apex, columns.target, columns.time = (
+            slices[name].start if name in slices else -1 for name in ("apex", "target", "target_time")
+        )
+        noise = wp.from_torch(self.sensing.base_shift_noise, dtype=wp.vec2)
+        seen = [share(self.track.something_to_hit), share(self.sensing.base_position), noise]
+        shift = wp.from_torch(self.shift, dtype=wp.vec2)
+        results = [share(self.apex), share(self.target), share(self.time), shift]
+        inputs = [wp.from_torch(self.prediction), columns, *seen, rules, *results]
+        return record(read_prediction, self.action.shape[0], inputs, self.action.device)
+
+    def compute(self, changed: Tensor | None = None) -> None:
+        """Everything that follows from the current ``sensing``, ``track`` and ``action``.
+
+        ``changed`` (N,) bool: the worlds in which they are new; ``None``: all.
+        """
         sensing = self.sensing
-        orientation = base_orientation(sensing.projected_gravity, sensing.heading)
-        joints = sensing.joint_position + self._nominal
-        centre, normal = self._kinematics.paddle_pose(sensing.base_position, orientation, joints)
+        torch.add(sensing.joint_position, self._nominal, out=self._joints)
+        centre, normal = self._kinematics.paddle_pose(sensing.base_position, sensing.base_quat, self._joints)
         self.paddle_position.copy_(centre)
         self.paddle_normal.copy_(normal)
         if self.predictor is not None:
-            self._predict(self.predictor)
+            with torch.no_grad(), torch.autocast(self.prediction.device.type, enabled=False):
+                self._predict(self.predictor, changed)
+            self._read()
 
-    def _predict(self, predictor: Predictor) -> None:
-        with torch.no_grad(), torch.autocast(self.prediction.device.type, enabled=False):
+    def _predict(self, predictor: Predictor, changed: Tensor | None) -> None:
+        if changed is not None and changed.device.type == "cpu":  # looking costs no wait there, and few are new
+            rows = changed.nonzero().squeeze(1)
+            self.prediction[rows] = predictor(self.track.positions[rows])
+        else:
             self.prediction.copy_(predictor(self.track.positions))
-        active = self.track.something_to_hit
-        wide = active.unsqueeze(-1)
-        apex = self.prediction[:, self._slices["apex"]]
-        own = "target" in self._slices
-        target = self.prediction[:, self._slices["target"]] if own else clamp_x(apex, self._target_x)
-        self.apex.copy_(torch.where(wide, apex, self._idle_point))
-        self.target.copy_(torch.where(wide, target, self._idle_point))
-        if "target_time" in self._slices:
-            time = self.prediction[:, self._slices["target_time"].start].clamp(0.0, LONGEST_TIME)
-            torch.mul(time, active, out=self.time)
-        goal = (target if self._intercept else apex)[:, :2] + self._arm_offset
-        goal = torch.where(wide, goal, self._idle_base)
-        torch.sub(goal, self.sensing.base_position[:, :2], out=self.shift)
-        self.shift.add_(self.sensing.base_shift_noise)
 
 
 def predictor_slices(outputs: list[str]) -> dict[str, slice]:
@@ -154,38 +177,6 @@ def predictor_slices(outputs: list[str]) -> dict[str, slice]:
     return {name: slice(end - OUTPUT_SIZES[name], end) for name, end in zip(outputs, ends, strict=True)}
 
 
-class CriticSignals:
-    """All that the critic sees: the true state, and the forecast where there is something to hit.
-
-    Attributes: ``state``; ``apex``, ``target`` (N, 3) m, idle where there is nothing to hit; ``time`` (N,) s until the
-    ball is at the target, ``shift`` (N, 2) m.
-    """
-
-    def __init__(self, state: TaskState, reward: RewardConfig) -> None:
-        self.state = state
-        self._intercept = reward.target_mode == "intercept"
-        device = state.action.device
-        self._arm_offset = torch.tensor(reward.arm_offset, device=device)
-        self._idle_base = torch.tensor(reward.idle_base_xy, device=device)
-        self.apex, self.target = torch.zeros_like(state.game.target.apex), torch.zeros_like(state.game.target.apex)
-        self.time = torch.zeros_like(state.game.target.time)
-        self.shift = torch.zeros_like(state.base_error)
-
-    def compute(self) -> None:
-        """Everything that follows from the current state."""
-        state, target = self.state, self.state.game.target
-        wide = state.something_to_hit.unsqueeze(-1)
-        self.apex.copy_(torch.where(wide, target.apex, target.idle_point))
-        self.target.copy_(torch.where(wide, target.point, target.idle_point))
-        left = (target.time - state.game.clock.time).clamp_(0.0, LONGEST_TIME)
-        torch.mul(left, state.something_to_hit, out=self.time)
-        if self._intercept:
-            self.shift.copy_(state.base_error)
-            return
-        goal = torch.where(wide, self.apex[:, :2] + self._arm_offset, self._idle_base)
-        torch.sub(goal, state.robot.base_position[:, :2], out=self.shift)
-
-
 class ActorObservation(NamedTuple):
     """Size and function of one observation of the actor."""
 
@@ -197,7 +188,7 @@ class CriticObservation(NamedTuple):
     """Size and function of one observation of the critic."""
 
     size: int
-    function: Callable[[CriticSignals], Tensor]
+    function: Callable[[TaskState], Tensor]
 
 
 def _column(values: Tensor) -> Tensor:
@@ -224,28 +215,28 @@ POLICY: dict[str, ActorObservation] = {
 
 #: What the critic can see: the truth.
 CRITIC: dict[str, CriticObservation] = {
-    "base_angular_velocity": CriticObservation(3, lambda s: s.state.robot.base_angular_velocity),
-    "base_position": CriticObservation(3, lambda s: s.state.robot.base_position),
-    "projected_gravity": CriticObservation(3, lambda s: s.state.robot.projected_gravity),
-    "joint_position": CriticObservation(JOINTS, lambda s: s.state.robot.joint_position - s.state.nominal),
-    "joint_velocity": CriticObservation(JOINTS, lambda s: s.state.robot.joint_velocity),
-    "previous_action": CriticObservation(JOINTS, lambda s: s.state.action),
-    "ball_position": CriticObservation(3, lambda s: s.state.ball.position),
-    "heading": CriticObservation(2, lambda s: s.state.robot.heading),
+    "base_angular_velocity": CriticObservation(3, lambda s: s.robot.base_angular_velocity),
+    "base_position": CriticObservation(3, lambda s: s.robot.base_position),
+    "projected_gravity": CriticObservation(3, lambda s: s.robot.projected_gravity),
+    "joint_position": CriticObservation(JOINTS, lambda s: s.robot.joint_position - s.nominal),
+    "joint_velocity": CriticObservation(JOINTS, lambda s: s.robot.joint_velocity),
+    "previous_action": CriticObservation(JOINTS, lambda s: s.action),
+    "ball_position": CriticObservation(3, lambda s: s.ball.position),
+    "heading": CriticObservation(2, lambda s: s.robot.heading),
     "apex": CriticObservation(3, lambda s: s.apex),
     "base_shift": CriticObservation(2, lambda s: s.shift),
-    "ball_velocity": CriticObservation(3, lambda s: s.state.ball.velocity),
-    "paddle_position": CriticObservation(3, lambda s: s.state.robot.paddle_position),
-    "time_to_arrival": CriticObservation(1, lambda s: _column(s.time)),
-    "serve_progress": CriticObservation(1, lambda s: _column(s.state.game.clock.serve_progress)),
-    "episode_progress": CriticObservation(1, lambda s: _column(s.state.game.clock.episode_progress)),
-    "own_bounce": CriticObservation(1, lambda s: _column(s.state.game.referee.own_bounces > 0)),
-    "paddle_touched": CriticObservation(1, lambda s: _column(s.state.game.referee.touched)),
-    "base_linear_velocity": CriticObservation(3, lambda s: s.state.robot.base_linear_velocity),
-    "foot_contact": CriticObservation(2, lambda s: s.state.foot_contact.float()),
-    "paddle_to_target": CriticObservation(3, lambda s: s.target - s.state.robot.paddle_position),
-    "paddle_velocity": CriticObservation(3, lambda s: s.state.robot.paddle_velocity),
-    "paddle_normal": CriticObservation(3, lambda s: s.state.robot.paddle_normal),
+    "ball_velocity": CriticObservation(3, lambda s: s.ball.velocity),
+    "paddle_position": CriticObservation(3, lambda s: s.robot.paddle_position),
+    "time_to_arrival": CriticObservation(1, lambda s: _column(s.arrival)),
+    "serve_progress": CriticObservation(1, lambda s: _column(s.game.clock.serve_progress)),
+    "episode_progress": CriticObservation(1, lambda s: _column(s.game.clock.episode_progress)),
+    "own_bounce": CriticObservation(1, lambda s: _column(s.game.referee.own_bounces > 0)),
+    "paddle_touched": CriticObservation(1, lambda s: _column(s.game.referee.touched)),
+    "base_linear_velocity": CriticObservation(3, lambda s: s.robot.base_linear_velocity),
+    "foot_contact": CriticObservation(2, lambda s: s.foot_contact.float()),
+    "paddle_to_target": CriticObservation(3, lambda s: s.target - s.robot.paddle_position),
+    "paddle_velocity": CriticObservation(3, lambda s: s.robot.paddle_velocity),
+    "paddle_normal": CriticObservation(3, lambda s: s.robot.paddle_normal),
 }
 
 Table = Mapping[str, ActorObservation] | Mapping[str, CriticObservation]
@@ -301,5 +292,8 @@ class History:
     def fill(self, mask: Tensor, signals: list[Tensor]) -> None:
         """Set all frames of the worlds of ``mask`` (N,) bool to the current one."""
         torch.cat(signals, dim=1, out=self.frame)
-        wide = mask.view(-1, 1, 1)
-        torch.where(wide, self.frame.unsqueeze(1), self.frames, out=self.frames)
+        if mask.device.type == "cpu":  # looking costs no wait there, and few worlds are reset in one step
+            rows = mask.nonzero().squeeze(1)
+            self.frames[rows] = self.frame[rows].unsqueeze(1)
+        else:
+            torch.where(mask.view(-1, 1, 1), self.frame.unsqueeze(1), self.frames, out=self.frames)

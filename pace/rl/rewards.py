@@ -47,7 +47,7 @@ def _length(vector: Tensor) -> Tensor:
 
 def _kernel(error: Tensor, params: Params) -> Tensor:
     """exp(-max(error, tolerance) / sigma^2): flat near the goal."""
-    return torch.exp(error.clamp(min=params["tolerance"]) * (-1.0 / params["sigma"] ** 2))
+    return error.clamp(min=params["tolerance"]).mul_(-1.0 / params["sigma"] ** 2).exp_()
 
 
 # --- towards the ball -------------------------------------------------------------------------------------------------
@@ -159,8 +159,8 @@ def base_tilt(state: TaskState, params: Params) -> Tensor:
 @term("x", "margin", "sigma")
 def table_proximity(state: TaskState, params: Params) -> Tensor:
     """exp(-abs(base x - (x - margin)) / sigma^2): a wall of penalty before the table's edge at x, m."""
-    distance = (state.robot.base_position[:, 0] - (params["x"] - params["margin"])).abs()
-    return torch.exp(distance * (-1.0 / params["sigma"] ** 2))
+    distance = (state.robot.base_position[:, 0] - (params["x"] - params["margin"])).abs_()
+    return distance.mul_(-1.0 / params["sigma"] ** 2).exp_()
 
 
 @term()
@@ -213,7 +213,7 @@ def joint_limits(state: TaskState, params: Params) -> Tensor:
     """How far joints are beyond the inner ``fraction`` of their range, summed, rad."""
     middle = 0.5 * (state.joint_upper + state.joint_lower)
     reach = 0.5 * params["fraction"] * (state.joint_upper - state.joint_lower)
-    return ((state.robot.joint_position - middle).abs() - reach).clamp_(min=0.0).sum(1)
+    return (state.robot.joint_position - middle).abs_().sub_(reach).clamp_(min=0.0).sum(1)
 
 
 @term()

@@ -7,15 +7,13 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from pace.config import RewardConfig
-from pace.rl.task import Game, nothing_to_hit
+from pace.rl.task import Game
+from pace.rl.task_kernels import DerivedArrays, derive
+from pace.sim.sharing import record, share, share_all
 
 if TYPE_CHECKING:
     from pace.sim.ball import BallSim
     from pace.sim.worlds import RobotState, Worlds
-
-#: A foot that pushes with less touches nothing, N.
-CONTACT_FORCE = 1.0
 
 
 def _is_right_arm(name: str) -> bool:
@@ -41,16 +39,17 @@ class TaskState:
 
     Attributes: ``robot``, ``ball`` (simulation), ``game`` (rules and forecast), ``action`` and ``previous_action``
     (N, J); ``nominal``, ``joint_lower``, ``joint_upper`` (J,) rad; ``groups`` name -> (J,) of 0 and 1.
-    After :meth:`refresh`: ``something_to_hit``, ``lost`` (N,) bool, ``base_error`` (N, 2) m from the base to its
-    target, ``foot_load`` (N, 2) N, ``foot_contact`` (N, 2) bool, ``feet_distance`` (N,) m, ``joint_power`` (N, J) W,
-    ``joint_deviation`` (N, J) rad.
+    After :meth:`refresh`: ``joint_power`` (N, J) W, ``joint_deviation`` (N, J) rad, and what :meth:`derive` computes:
+    ``something_to_hit`` (N,) bool; ``apex``, ``target`` (N, 3) m, the point to stand by where there is nothing to hit;
+    ``arrival`` (N,) s until the ball is at the target, 0 where there is nothing to hit; ``base_error``, ``shift``
+    (N, 2) m from the base to where it should stand, for the rewards and as the networks see it; ``foot_load``
+    (N, 2) N, ``foot_contact`` (N, 2) bool, ``feet_distance`` (N,) m.
     """
 
-    def __init__(self, worlds: Worlds, game: Game, config: RewardConfig) -> None:
+    def __init__(self, worlds: Worlds, game: Game) -> None:
         self.robot: RobotState = worlds.robot
         self.ball: BallSim = worlds.ball
         self.game = game
-        self._config = config
         self.nominal, self.joint_lower, self.joint_upper = worlds.nominal, worlds.joint_lower, worlds.joint_upper
         count, joints, device = worlds.num_worlds, worlds.nominal.shape[0], worlds.device
         self.action = torch.zeros(count, joints, device=device)
@@ -59,33 +58,33 @@ class TaskState:
             group: torch.tensor([float(belongs(name)) for name in worlds.joint_names], device=device)
             for group, belongs in JOINT_GROUPS.items()
         }
-        self._arm_offset = torch.tensor(config.arm_offset, device=device)
-        self._idle_base = torch.tensor(config.idle_base_xy, device=device)
-        self.something_to_hit = torch.zeros(count, dtype=torch.bool, device=device)
-        self.lost = torch.zeros(count, dtype=torch.bool, device=device)
-        self.base_error = torch.zeros(count, 2, device=device)
+        self.lost, self.something_to_hit = game.ends.lost, game.target.something_to_hit
+        self.joint_power = torch.zeros(count, joints, device=device)
+        self.joint_deviation = torch.zeros(count, joints, device=device)
+        self._allocate(count, device)
+        self._record(worlds)
+
+    def _allocate(self, count: int, device: torch.device) -> None:
+        self.base_error, self.shift = torch.zeros(count, 2, device=device), torch.zeros(count, 2, device=device)
+        self.apex, self.target = torch.zeros(count, 3, device=device), torch.zeros(count, 3, device=device)
+        self.arrival = torch.zeros(count, device=device)
         self.foot_load = torch.zeros(count, 2, device=device)
         self.foot_contact = torch.zeros(count, 2, dtype=torch.bool, device=device)
         self.feet_distance = torch.zeros(count, device=device)
-        self.joint_power = torch.zeros(count, joints, device=device)
-        self.joint_deviation = torch.zeros(count, joints, device=device)
+
+    def _record(self, worlds: Worlds) -> None:
+        ball, robot = self.ball, self.robot
+        seen = (ball.position, ball.velocity, robot.base_position, robot.foot_force, robot.foot_position)
+        derived = share_all(DerivedArrays, vars(self))
+        inputs = [self.game.arrays(), derived, *(share(tensor) for tensor in seen), self.game.rules]
+        self._derive = record(derive, worlds.num_worlds, inputs, worlds.device)
 
     def refresh(self) -> None:
-        """Compute the shared quantities from the robot's new state."""
-        robot = self.robot
-        torch.linalg.vector_norm(robot.foot_force, dim=-1, out=self.foot_load)
-        torch.gt(self.foot_load, CONTACT_FORCE, out=self.foot_contact)
-        apart = robot.foot_position[:, 0] - robot.foot_position[:, 1]
-        torch.linalg.vector_norm(apart, dim=-1, out=self.feet_distance)
-        torch.mul(robot.joint_torque, robot.joint_velocity, out=self.joint_power)
-        torch.sub(robot.joint_position, self.nominal, out=self.joint_deviation).abs_()
-        self.refresh_target()
+        """Compute all shared quantities from the robot's and the ball's new state."""
+        torch.mul(self.robot.joint_torque, self.robot.joint_velocity, out=self.joint_power)
+        torch.sub(self.robot.joint_position, self.nominal, out=self.joint_deviation).abs_()
+        self._derive()
 
-    def refresh_target(self) -> None:
-        """Compute whether there is something to hit, and where the base should be; again after a new serve."""
-        closed = nothing_to_hit(self.ball.position, self.ball.velocity, self._config.nothing_to_hit)
-        referee = self.game.referee
-        torch.logical_and(referee.is_open & ~referee.touched, ~closed, out=self.something_to_hit)
-        target = self.game.target.point[:, :2] + self._arm_offset
-        goal = torch.where(self.something_to_hit.unsqueeze(-1), target, self._idle_base)
-        torch.sub(goal, self.robot.base_position[:, :2], out=self.base_error)
+    def derive(self) -> None:
+        """Compute those again that change with a new serve."""
+        self._derive()

@@ -1,34 +1,28 @@
-"""Table tennis as a task: serves, the referee, and what the ball's forecast asks of the robot."""
+"""Table tennis as a task: serves, the referee, and what the ball's forecast asks of the robot.
+
+The rules themselves are the kernels of :mod:`pace.rl.task_kernels`; here are their tensors and their order.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from enum import IntEnum
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from pace.config import ResetConfig, RewardConfig, RobotConfig, ServeConfig
-from pace.sim.snapshot import restore, snapshot
+from pace.config import ResetConfig, RewardConfig, RobotConfig, ServeConfig, TaskConfig
+from pace.rl import task_kernels
+from pace.rl.outcome import Outcome
+from pace.rl.task_kernels import GameArrays, Rules
+from pace.sim.ball_kernels import EventArrays, ForecastArrays
+from pace.sim.sharing import record, share, share_all
+from pace.sim.snapshot import restore, snapshot, under_prefix, with_prefix
 
 if TYPE_CHECKING:
-    from pace.sim.ball import BallEvents, Forecast
+    from pace.sim.ball import BallSim
 
-
-class Outcome(IntEnum):
-    """How a serve ended. All but ``OPEN`` and ``BAD_SERVE`` count in the rates."""
-
-    OPEN = 0  # not decided yet
-    SUCCESS = 1  # hit, then landed first on the opponent's half
-    MISS = 2  # the ball passed, fell or bounced twice before a hit
-    NET = 3  # hit, touched the net and did not get over
-    OUT = 4  # hit, then landed beside or beyond the table
-    OWN_SIDE = 5  # hit, then bounced on the own half
-    DOUBLE_HIT = 6  # a second paddle contact before the ball landed
-    VOLLEY = 7  # paddle contact before the bounce on the own half
-    FALL = 8  # the robot fell or left its area before the serve was decided
-    BAD_SERVE = 9  # the serve never bounces on the robot's half: not the robot's fault
+__all__ = ["Game", "Outcome", "PoseSampler", "ServeSampler"]
 
 
 def uniform(generator: torch.Generator, low: Tensor, high: Tensor, num_worlds: int) -> Tensor:
@@ -96,8 +90,16 @@ class PoseSampler:
         return qpos, qvel
 
 
-class Referee:
-    """Knows the rules. Consumes the events of each control step in the order of their times.
+class Part:
+    """Tensors of a :class:`Game` that belong together."""
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The tensors themselves, by name."""
+        return {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
+
+
+class Referee(Part):
+    """What the referee knows of each serve.
 
     A hit is physical contact after exactly one bounce on the own half; a valid return then lands first on the
     opponent's half (it may touch the net on the way). What is decided stays decided until the next serve.
@@ -105,151 +107,50 @@ class Referee:
     contact at once, which is exact unless a ball meets the table twice and the paddle within 20 ms.
 
     Attributes, all (N,): ``own_bounces`` int, ``hit`` bool (legal), ``touched`` bool (any paddle contact), ``rim``,
-    ``net_touched`` bool (after the hit), ``touch_time`` s on the serve clock (inf before), ``outcome`` int; of this
-    step: ``was_open``, ``hit_now``, ``success_now`` bool.
+    ``net_touched`` bool (after the hit), ``touch_time`` s on the serve clock (inf before), ``outcome`` int
+    (:class:`Outcome`); of the last step: ``was_open`` before it, ``hit_now``, ``success_now`` bool.
     """
 
     def __init__(self, num_worlds: int, device: torch.device) -> None:
-        def flags() -> Tensor:
-            return torch.zeros(num_worlds, dtype=torch.bool, device=device)
-
         self.own_bounces = torch.zeros(num_worlds, dtype=torch.int32, device=device)
-        self.outcome = torch.full((num_worlds,), Outcome.BAD_SERVE, dtype=torch.int32, device=device)
+        self.outcome = torch.full((num_worlds,), int(Outcome.BAD_SERVE), dtype=torch.int32, device=device)
         self.touch_time = torch.full((num_worlds,), torch.inf, device=device)
-        self.hit, self.touched, self.rim, self.net_touched = flags(), flags(), flags(), flags()
-        self.was_open, self.hit_now, self.success_now = flags(), flags(), flags()
+        flags = torch.zeros(7, num_worlds, dtype=torch.bool, device=device)
+        self.hit, self.touched, self.rim, self.net_touched = (flag.clone() for flag in flags[:4])
+        self.was_open, self.hit_now, self.success_now = (flag.clone() for flag in flags[4:])
 
     @property
     def is_open(self) -> Tensor:
         """Whether the serve is undecided (N,) bool."""
         return self.outcome == Outcome.OPEN
 
-    def start(self, mask: Tensor, playable: Tensor) -> None:
-        """Begin a serve in the worlds of ``mask`` (N,); ``playable`` (N,): the serve will bounce on the own half."""
-        self.own_bounces.masked_fill_(mask, 0)
-        self.touch_time.masked_fill_(mask, torch.inf)
-        for flag in (self.hit, self.touched, self.rim, self.net_touched):
-            flag.masked_fill_(mask, False)
-        self.outcome.masked_fill_(mask & playable, Outcome.OPEN)
-        self.outcome.masked_fill_(mask & ~playable, Outcome.BAD_SERVE)
 
-    def judge(self, events: BallEvents, step_start: Tensor, ball_x: Tensor) -> None:
-        """Consume the events of one control step that began at ``step_start`` (N,) s; ``ball_x`` (N,) m at its end."""
-        torch.eq(self.outcome, Outcome.OPEN, out=self.was_open)
-        struck = events.paddle_hit > 0
-        bounce_first = events.own_bounce_time < events.paddle_hit_time
-        before = self.own_bounces + torch.where(struck, bounce_first.int(), events.own_bounce)
-        dead = torch.minimum(events.floor_time, events.edge_time)
-        lost = (before >= 2) | (dead < events.paddle_hit_time)
-        waiting = self.was_open & ~self.hit
-        in_play = waiting & struck & ~lost
-        torch.logical_and(in_play, before == 1, out=self.hit_now)
-        volley = in_play & (before == 0)
-        flight = self._judge_flight(events, bounce_first, dead, ball_x)
-        self.hit |= self.hit_now
-        self.outcome.copy_(torch.where(self.was_open & self.hit, flight, self.outcome))
-        self.outcome.masked_fill_(volley, Outcome.VOLLEY)
-        self.outcome.masked_fill_(waiting & lost, Outcome.MISS)
-        self.own_bounces += events.own_bounce
-        self.rim |= self.hit_now & (events.hit_rim > 0)
-        first_touch = step_start + events.paddle_hit_time
-        self.touch_time.copy_(torch.where(self.touched, self.touch_time, first_touch))
-        self.touched |= struck
-
-    def _judge_flight(self, events: BallEvents, bounce_first: Tensor, dead: Tensor, ball_x: Tensor) -> Tensor:
-        """Outcome (N,) of balls in flight after a legal hit: ``OPEN`` while nothing has happened to them.
-
-        ``dead`` (N,) s: when the ball met the floor or the table's sides or underside, which are not playing surface.
-        """
-        since = torch.where(self.hit, -1.0, torch.where(self.hit_now, events.paddle_hit_time, torch.inf))
-        own_count = events.own_bounce - (self.hit_now & bounce_first).int()
-        own = torch.where(own_count > 0, torch.maximum(events.own_bounce_time, since), torch.inf)
-        second_touch = events.paddle_hit - self.hit_now.int() > 0
-        again = torch.where(second_touch, torch.maximum(events.paddle_hit_time, since), torch.inf)
-        opponent = _after(events.opponent_bounce_time, since)
-        off_table = _after(dead, since)
-        first, kind = torch.stack((opponent, own, off_table, again)).min(0)
-        net = _after(events.net_time, since)
-        self.net_touched |= (net <= first) & net.isfinite()
-        outcome = landed(kind == 0, kind == 1, self.net_touched, ball_x)
-        outcome = torch.where(kind == 3, int(Outcome.DOUBLE_HIT), outcome)
-        return torch.where(first.isfinite(), outcome, int(Outcome.OPEN)).int()
-
-    def close(self, over: Tensor, fallen: Tensor, returns: ReturnForecast) -> None:
-        """Decide the serves that end now. All masks (N,) bool.
-
-        Args:
-            over: the serve ends. A flight that the clock cuts off is decided by its forecast; without a hit it is
-                a miss.
-            fallen: the robot fell, or left its area.
-            returns: forecast of the flight after the hit.
-        """
-        is_open = self.is_open
-        cut_off = landed(returns.lands_opponent, returns.lands_own, self.net_touched, returns.landing[:, 0])
-        decided = torch.where(self.hit, cut_off, int(Outcome.MISS))
-        self.outcome.copy_(torch.where(is_open & over, decided, self.outcome))
-        self.outcome.masked_fill_(is_open & fallen, Outcome.FALL)
-        torch.logical_and(self.was_open, self.outcome == Outcome.SUCCESS, out=self.success_now)
-
-
-def _after(time: Tensor, since: Tensor) -> Tensor:
-    return torch.where(time > since, time, torch.inf)
-
-
-def landed(on_opponent: Tensor, on_own: Tensor, net_touched: Tensor, x: Tensor) -> Tensor:
-    """Outcome (N,) of a hit ball by where it lands first; off the table it is out, or caught by the net."""
-    caught = net_touched & (on_own | (x < 0.0))
-    fault = torch.where(on_own, int(Outcome.OWN_SIDE), int(Outcome.OUT))
-    fault = torch.where(caught, int(Outcome.NET), fault)
-    return torch.where(on_opponent, int(Outcome.SUCCESS), fault).int()
-
-
-class Target:
+class Target(Part):
     """Where and when the paddle should meet the ball: from the forecast of the serve. World frame, serve clock.
 
     Attributes: ``playable`` (N,) bool, ``apex`` (N, 3) m, ``apex_time`` (N,) s, ``point`` (N, 3) m the paddle's
-    target, ``time`` (N,) s when the ball is there; ``idle_point`` (3,) m: a target to stand by while there is nothing
+    target, ``time`` (N,) s when the ball is there; ``something_to_hit`` (N,) bool, the ball can still be hit legally;
+    ``idle_point`` (3,) m: a target to stand by while there is nothing
     to hit, the one that belongs to the idle base position.
     """
 
     def __init__(self, config: RewardConfig, num_worlds: int, device: torch.device) -> None:
-        self._intercept = config.target_mode == "intercept"
-        self._x = config.target_x
-        idle_xy = [base - arm for base, arm in zip(config.idle_base_xy, config.arm_offset, strict=True)]
-        self.idle_point = torch.tensor([*idle_xy, config.idle_height], device=device)
+        self.idle_point = torch.tensor(idle_point(config), device=device)
         self.playable = torch.zeros(num_worlds, dtype=torch.bool, device=device)
+        self.something_to_hit = torch.zeros(num_worlds, dtype=torch.bool, device=device)
         self.apex = self.idle_point.repeat(num_worlds, 1)
         self.point = self.idle_point.repeat(num_worlds, 1)
         self.apex_time = torch.zeros(num_worlds, device=device)
         self.time = torch.zeros(num_worlds, device=device)
 
-    def aim(self, mask: Tensor, forecast: Forecast) -> None:
-        """Take the forecast of the serves that begin in the worlds of ``mask`` (N,) bool."""
-        playable = forecast.bounce_time.isfinite() & forecast.apex_time.isfinite()
-        apex = torch.where(playable.unsqueeze(-1), forecast.apex, self.idle_point)
-        apex_time = torch.where(playable, forecast.apex_time, 0.0)
-        point, time = self._paddle_target(apex, apex_time, forecast)
-        wide = mask.unsqueeze(-1)
-        self.playable.copy_(torch.where(mask, playable, self.playable))
-        self.apex.copy_(torch.where(wide, apex, self.apex))
-        self.point.copy_(torch.where(wide, point, self.point))
-        self.apex_time.copy_(torch.where(mask, apex_time, self.apex_time))
-        self.time.copy_(torch.where(mask, time, self.time))
 
-    def _paddle_target(self, apex: Tensor, apex_time: Tensor, forecast: Forecast) -> tuple[Tensor, Tensor]:
-        if self._intercept:
-            reached = forecast.intercept_time.isfinite()
-            point = torch.where(reached.unsqueeze(-1), forecast.intercept, apex)
-            return point, torch.where(reached, forecast.intercept_time, apex_time)
-        return clamp_x(apex, self._x), apex_time
+def idle_point(config: RewardConfig) -> list[float]:
+    """Target of the paddle (m, world frame) that belongs to the idle base position."""
+    idle_xy = [base - arm for base, arm in zip(config.idle_base_xy, config.arm_offset, strict=True)]
+    return [*idle_xy, config.idle_height]
 
 
-def clamp_x(point: Tensor, largest: float) -> Tensor:
-    """``point`` (N, 3) with its x at most ``largest``."""
-    return torch.cat((point[:, :1].clamp(max=largest), point[:, 1:]), dim=1)
-
-
-class ReturnForecast:
+class ReturnForecast(Part):
     """Forecast of the flight after a hit, kept until the next one.
 
     Attributes: ``landing`` (N, 3) m first contact with table or floor, ``net_height`` (N,) m above the floor when it
@@ -262,25 +163,8 @@ class ReturnForecast:
         self.lands_own = torch.zeros(num_worlds, dtype=torch.bool, device=device)
         self.lands_opponent = torch.zeros(num_worlds, dtype=torch.bool, device=device)
 
-    def take(self, mask: Tensor, forecast: Forecast) -> None:
-        """Take the forecast of the balls that were hit in the worlds of ``mask`` (N,) bool."""
-        self.landing.copy_(torch.where(mask.unsqueeze(-1), forecast.landing, self.landing))
-        self.net_height.copy_(torch.where(mask, forecast.net_height, self.net_height))
-        self.lands_own.copy_(torch.where(mask, forecast.landing_own > 0, self.lands_own))
-        self.lands_opponent.copy_(torch.where(mask, forecast.landing_opponent > 0, self.lands_opponent))
 
-
-def nothing_to_hit(position: Tensor, velocity: Tensor, rule: Mapping[str, float]) -> Tensor:
-    """Whether a ball at ``position`` (N, 3) m with ``velocity`` (N, 3) m/s cannot be hit any more: (N,) bool.
-
-    It is past ``past_x``, moves away, is below ``low_z``, or falls past ``falling_x`` (m, world frame).
-    """
-    x, _, z = position.unbind(1)
-    gone = (x < rule["past_x"]) | (velocity[:, 0] > 0.0) | (z < rule["low_z"])
-    return gone | ((x < rule["falling_x"]) & (velocity[:, 2] < 0.0))
-
-
-class Closeness:
+class Closeness(Part):
     """How near the paddle came to the ball while it could be hit legally, over each serve.
 
     Attributes (N,): ``nearest`` m, smallest distance from the face centre to the ball's surface so far (inf at the
@@ -294,26 +178,12 @@ class Closeness:
         self.arrived = torch.zeros(num_worlds, dtype=torch.bool, device=device)
         self.arrived_now = torch.zeros(num_worlds, dtype=torch.bool, device=device)
 
-    def start(self, mask: Tensor) -> None:
-        """Begin a serve in the worlds of ``mask`` (N,)."""
-        self.nearest.masked_fill_(mask, torch.inf)
-        self.previous.masked_fill_(mask, torch.inf)
-        self.arrived.masked_fill_(mask, False)
 
-    def update(self, referee: Referee, distance: Tensor, due: Tensor) -> None:
-        """Take this step's ``distance`` (N,) m; ``due`` (N,) bool: the target time has come."""
-        playable = referee.was_open & (referee.own_bounces >= 1) & (referee.hit_now | ~referee.touched)
-        self.previous.copy_(self.nearest)
-        torch.where(playable, torch.minimum(self.nearest, distance), self.nearest, out=self.nearest)
-        torch.logical_and(playable & (due | referee.hit_now), ~self.arrived, out=self.arrived_now)
-        self.arrived |= self.arrived_now
-
-
-class ServeClock:
+class ServeClock(Part):
     """Counts serves and their time.
 
     Attributes (N,): ``time`` s since the serve began, ``index`` number of the serve in its episode, ``played`` serves
-    finished since the world was made.
+    finished since the world was made, ``fresh`` bool: the world has not been reset yet.
     """
 
     def __init__(self, config: ServeConfig, num_worlds: int, device: torch.device) -> None:
@@ -328,27 +198,13 @@ class ServeClock:
         count = self._config.serves_per_episode
         first = torch.rand(self.index.shape, device=self.index.device, generator=generator).mul_(count).floor_()
         random = self.fresh & (self._config.random_phase and count > 0)
-        self.index.copy_(torch.where(mask, torch.where(random, first, 0.0), self.index))
+        self.index.copy_(torch.where(mask, first * random, self.index))
         self.fresh &= ~mask
-
-    def over(self, ball_z: Tensor, floor: Tensor, touch_time: Tensor) -> Tensor:
-        """Which serves end now (N,) bool: ball low or on the floor, time up, or long enough after the contact."""
-        low = (ball_z < self._config.end_height) | (floor > 0)
-        over = low | (self.time >= self._config.max_duration)
-        if self._config.end_after_hit > 0.0:
-            over |= self.time >= touch_time + self._config.end_after_hit
-        return over
 
     def finish(self, over: Tensor) -> None:
         """Count the serves that ended (N,) bool."""
         self.index += over
         self.played += over
-
-    def last_serve(self) -> Tensor:
-        """Whether the current serve is the last of its episode (N,) bool."""
-        if self._config.serves_per_episode == 0:
-            return torch.zeros_like(self.fresh)
-        return self.index + 1 >= self._config.serves_per_episode
 
     @property
     def serve_progress(self) -> Tensor:
@@ -363,36 +219,107 @@ class ServeClock:
         return ((self.index + self.serve_progress) / self._config.serves_per_episode).clamp(max=1.0)
 
 
-def lost_position(base_position: Tensor, config: ResetConfig) -> Tensor:
-    """Whether the robot has fallen or left its area (N,) bool, from the base position (N, 3) m."""
-    x, y, z = base_position.unbind(1)
-    outside_x = (x < config.bounds_x[0]) | (x > config.bounds_x[1])
-    return (z < config.min_base_height) | outside_x | (y < config.bounds_y[0]) | (y > config.bounds_y[1])
+class StepEnds(Part):
+    """What ended in the last control step.
+
+    Attributes (N,): ``lost`` bool, the robot fell or left its area; ``over`` bool, the serve ended; ``next_serve``
+    bool, and another one follows; ``truncated`` bool, it was the episode's last; ``outcome`` int and ``hit`` bool of
+    the present serve, also after the next one has begun.
+    """
+
+    def __init__(self, num_worlds: int, device: torch.device) -> None:
+        flags = torch.zeros(5, num_worlds, dtype=torch.bool, device=device)
+        self.lost, self.over, self.next_serve, self.truncated, self.hit = (flag.clone() for flag in flags)
+        self.outcome = torch.zeros(num_worlds, dtype=torch.int32, device=device)
+
+
+def rules_of(config: TaskConfig) -> Rules:
+    """The numbers of the configuration that the kernels need."""
+    serve, reset, reward = config.serve, config.reset, config.reward
+    rules = Rules()
+    rules.control_dt = config.robot.control_dt
+    rules.max_duration, rules.end_after_hit = serve.max_duration, serve.end_after_hit
+    rules.end_height, rules.serves_per_episode = serve.end_height, serve.serves_per_episode
+    rules.min_base_height, rules.bounds_x, rules.bounds_y = reset.min_base_height, reset.bounds_x, reset.bounds_y
+    rules.intercept, rules.target_x = int(reward.target_mode == "intercept"), reward.target_x
+    rules.arm_offset, rules.idle_base, rules.idle_point = reward.arm_offset, reward.idle_base_xy, idle_point(reward)
+    for name in ("past_x", "low_z", "falling_x"):
+        setattr(rules, name, reward.nothing_to_hit[name])
+    return rules
 
 
 class Game:
-    """Everything that the rules and the ball's forecast say about N worlds, by part, for saving and resuming."""
+    """Everything that the rules and the ball's forecast say about N worlds.
 
-    def __init__(self, serve: ServeConfig, reward: RewardConfig, num_worlds: int, device: torch.device) -> None:
-        self.clock = ServeClock(serve, num_worlds, device)
-        self.referee = Referee(num_worlds, device)
-        self.target = Target(reward, num_worlds, device)
-        self.returns = ReturnForecast(num_worlds, device)
-        self.closeness = Closeness(num_worlds, device)
+    In each control step: :meth:`judge`, a forecast of the balls of ``referee.hit_now``, :meth:`close`; then
+    :meth:`start_serve` after the forecast of new serves.
 
-    def start_serve(self, mask: Tensor, forecast: Forecast) -> None:
+    Args:
+        config: the task.
+        ball: the balls that are played; their tensors are read by each call.
+        base_position: (N, 3) m, of the robots; read by :meth:`close`.
+    """
+
+    def __init__(self, config: TaskConfig, ball: BallSim, base_position: Tensor) -> None:
+        count, device = ball.num_worlds, ball.device
+        self.clock = ServeClock(config.serve, count, device)
+        self.referee = Referee(count, device)
+        self.target = Target(config.reward, count, device)
+        self.returns = ReturnForecast(count, device)
+        self.closeness = Closeness(count, device)
+        self.ends = StepEnds(count, device)
+        self.rules = rules_of(config)
+        self._mask = torch.zeros(count, dtype=torch.bool, device=device)
+        self._record(ball, base_position)
+
+    def _parts(self) -> Iterator[tuple[str, Part]]:
+        return ((name, part) for name, part in vars(self).items() if isinstance(part, Part))
+
+    def arrays(self) -> GameArrays:
+        """All tensors as the kernels see them."""
+        tensors = {name: value for _, part in self._parts() for name, value in part.tensors().items()}
+        tensors |= {"time": self.clock.time, "target_time": self.target.time}
+        tensors |= {"hit": self.referee.hit, "outcome": self.referee.outcome}
+        tensors |= {"ended_hit": self.ends.hit, "ended_outcome": self.ends.outcome}
+        return share_all(GameArrays, tensors)
+
+    def _record(self, ball: BallSim, base_position: Tensor) -> None:
+        count, device = ball.num_worlds, ball.device
+        game = self.arrays()
+        events = share_all(EventArrays, vars(ball.events))
+        forecast = share_all(ForecastArrays, vars(ball.forecast_result))
+        position, velocity = share(ball.position), share(ball.velocity)
+        self._judge = record(task_kernels.judge, count, [game, events, position], device)
+        radius = torch.as_tensor(ball.params.radius)  # shares the memory of the per-world tensor that it is
+        distances = [share(ball.nearest_paddle_distance), share(radius)]
+        inputs = [game, events, forecast, position, velocity, *distances, share(base_position), self.rules]
+        self._close = record(task_kernels.close, count, inputs, device)
+        inputs = [share(self._mask), game, forecast, position, velocity, self.rules]
+        self._start = record(task_kernels.start_serve, count, inputs, device)
+
+    def judge(self) -> None:
+        """The referee consumes the events of the control step."""
+        self._judge()
+
+    def close(self) -> None:
+        """Clock, forecasts of hits, ends: a serve that is cut off in flight is decided by its forecast; one that ends
+        without a hit is a miss, and a fall decides an open serve.
+        """
+        self._close()
+
+    def start_serve(self, mask: Tensor) -> None:
         """Begin the serve whose flight was forecast, in the worlds of ``mask`` (N,) bool."""
-        self.clock.time.masked_fill_(mask, 0.0)
-        self.target.aim(mask, forecast)
-        self.referee.start(mask, self.target.playable)
-        self.closeness.start(mask)
+        self._mask.copy_(mask)
+        self._start()
 
     def state_dict(self) -> dict[str, Tensor]:
         """Copies of all tensors, by part and name."""
-        return {f"{part}.{name}": value for part in vars(self) for name, value in snapshot(getattr(self, part)).items()}
+        state: dict[str, Tensor] = {}
+        for name, part in self._parts():
+            state |= with_prefix(name, snapshot(part))
+        return state
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Put back what :meth:`state_dict` returned."""
-        for part, owner in vars(self).items():
-            prefix = f"{part}."
-            restore(owner, {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
+        for name, part in self._parts():
+            restore(part, under_prefix(name, state))

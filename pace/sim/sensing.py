@@ -9,16 +9,111 @@ import math
 from typing import TYPE_CHECKING
 
 import torch
+import warp as wp
 from torch import Tensor
 
 from pace.config import SensingConfig
+from pace.sim.sharing import record, share
 
 if TYPE_CHECKING:
     from pace.sim.worlds import RobotState
 
-MOCAP_COLUMNS = 8  # base position 3, ball position 3, heading 2
-BALL = slice(3, 6)  # the ball's columns among them
-SHIFT_COLUMNS = 2  # noise for the base shift, which is computed from sensed values and has noise of its own
+#: Columns of a motion-capture frame: base position 3, ball position 3, heading 2.
+MOCAP_COLUMNS = 8
+BASE, BALL, HEADING = wp.constant(0), wp.constant(3), wp.constant(6)
+
+
+@wp.struct
+class Truth:
+    """The quantities that sensors look at."""
+
+    base_angular_velocity: wp.array[wp.vec3]
+    projected_gravity: wp.array[wp.vec3]
+    joint_position: wp.array2d[wp.float32]
+    joint_velocity: wp.array2d[wp.float32]
+    base_position: wp.array[wp.vec3]
+    ball_position: wp.array[wp.vec3]
+    heading: wp.array2d[wp.float32]
+
+
+@wp.func
+def _see(truth: Truth, line: wp.array2d[wp.float32], world: int, new_ball: bool, new_world: bool):
+    """Put the newest motion-capture frame into a world's line, newest first; what is new has no past."""
+    if not new_world:
+        for age in range(line.shape[0] - 1, 0, -1):
+            for column in range(line.shape[1]):
+                line[age, column] = line[age - 1, column]
+    for i in range(3):
+        line[0, BASE + i] = truth.base_position[world][i]
+        line[0, BALL + i] = truth.ball_position[world][i]
+    for i in range(2):
+        line[0, HEADING + i] = truth.heading[world, i]
+    for age in range(1, line.shape[0]):
+        for column in range(line.shape[1]):
+            ball_column = column >= BALL and column < HEADING
+            if new_world or (new_ball and ball_column):
+                line[age, column] = line[0, column]
+
+
+@wp.func
+def _late(line: wp.array2d[wp.float32], delay: float, column: int) -> float:
+    """A column ``delay`` control steps ago, linear between frames."""
+    age = wp.min(int(delay), line.shape[0] - 2)
+    share = delay - float(age)
+    return (1.0 - share) * line[age, column] + share * line[age + 1, column]
+
+
+@wp.func
+def _orientation(gravity: wp.vec3, x: float, y: float) -> wp.vec4:
+    """Base quaternion w, x, y, z: gravity gives roll and pitch, heading (x, y) gives yaw (R = Rz Ry Rx)."""
+    roll = 0.5 * wp.atan2(-gravity[1], -gravity[2])
+    pitch = 0.5 * wp.atan2(gravity[0], wp.sqrt(gravity[1] * gravity[1] + gravity[2] * gravity[2]))
+    yaw = 0.5 * wp.atan2(y, x)
+    cr, sr = wp.cos(roll), wp.sin(roll)
+    cp, sp = wp.cos(pitch), wp.sin(pitch)
+    cy, sy = wp.cos(yaw), wp.sin(yaw)
+    return wp.vec4(
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
+
+
+@wp.kernel
+def _sense(
+    mask: wp.array[wp.bool],
+    reset: int,
+    seed: wp.array[wp.int32],
+    truth: Truth,
+    nominal: wp.array[wp.float32],
+    delay: wp.array[wp.float32],
+    amplitude: wp.array[wp.float32],
+    line: wp.array3d[wp.float32],
+    sensed: wp.array2d[wp.float32],
+    base_quat: wp.array[wp.vec4],
+):
+    """Sense one world. With ``reset`` the masked worlds only, as if they had stood still; else their ball is new."""
+    world = wp.tid()
+    if reset == 1 and not mask[world]:
+        return
+    _see(truth, line[world], world, mask[world], reset == 1)
+    row = sensed[world]
+    random = wp.rand_init(seed[world])
+    for column in range(row.shape[0]):
+        row[column] = amplitude[column] * (2.0 * wp.randf(random) - 1.0)
+    joints = nominal.shape[0]
+    for i in range(3):
+        row[i] += truth.base_angular_velocity[world][i]
+        row[3 + i] += truth.projected_gravity[world][i]
+    for joint in range(joints):
+        row[6 + joint] += truth.joint_position[world, joint] - nominal[joint]
+        row[6 + joints + joint] += truth.joint_velocity[world, joint]
+    mocap = 6 + 2 * joints
+    for column in range(line.shape[2]):
+        row[mocap + column] += _late(line[world], delay[world], column)
+    gravity = wp.vec3(row[3], row[4], row[5])
+    base_quat[world] = _orientation(gravity, row[mocap + HEADING], row[mocap + HEADING + 1])
 
 
 class Sensing:
@@ -30,7 +125,9 @@ class Sensing:
 
     Attributes: ``base_angular_velocity`` (N, 3) rad/s body frame, ``projected_gravity`` (N, 3), ``joint_position``
     (N, J) rad from the nominal pose, ``joint_velocity`` (N, J) rad/s, ``base_position`` (N, 3) m,
-    ``ball_position`` (N, 3) m, ``heading`` (N, 2), ``base_shift_noise`` (N, 2) m; world frame unless said.
+    ``ball_position`` (N, 3) m, ``heading`` (N, 2), ``base_quat`` (N, 4) w, x, y, z as sensed gravity (roll, pitch) and
+    heading (yaw) give it, ``base_shift_noise`` (N, 2) m for what is computed from sensed values; world frame unless
+    said.
     """
 
     def __init__(
@@ -42,102 +139,63 @@ class Sensing:
         nominal: Tensor,
         generator: torch.Generator,
     ) -> None:
-        joints = nominal.shape[0]
         self._low, self._high = (bound / control_dt for bound in config.mocap_delay)
-        self._generator = generator
+        self._num_worlds, self._device, self._generator = num_worlds, device, generator
         self._nominal = nominal
-        self._mocap = slice(6 + 2 * joints, 6 + 2 * joints + MOCAP_COLUMNS)
-        columns = self._mocap.stop
-        self._noise = torch.zeros(num_worlds, columns + SHIFT_COLUMNS, device=device)
-        self._amplitude = self._amplitudes(config, joints).to(device)
-        self._truth = torch.zeros(num_worlds, columns, device=device)
-        self._sensed = torch.zeros(num_worlds, columns + SHIFT_COLUMNS, device=device)
-        frames = max(2, math.ceil(self._high) + 1)
-        self._line = torch.zeros(frames, num_worlds, MOCAP_COLUMNS, device=device)  # newest first
-        self._weight = torch.zeros(frames, num_worlds, 1, device=device)
-        self._weight[0] = 1.0
-        self._steps_back = torch.arange(frames, device=device, dtype=torch.float32).view(-1, 1, 1)
-        self._bind(joints)
-
-    @staticmethod
-    def _amplitudes(config: SensingConfig, joints: int) -> Tensor:
-        parts = (
-            (3, config.base_angular_velocity),
-            (3, config.projected_gravity),
-            (joints, config.joint_position),
-            (joints, config.joint_velocity),
-            (3, config.base_position),
-            (3, config.ball_position),
-            (2, config.heading),
-            (SHIFT_COLUMNS, config.base_shift),
-        )
-        return torch.cat([torch.full((size,), amplitude) for size, amplitude in parts])
-
-    def _bind(self, joints: int) -> None:
-        sizes = [3, 3, joints, joints, 3, 3, 2, SHIFT_COLUMNS]
-        views = torch.split(self._sensed, sizes, dim=1)
+        joints = nominal.shape[0]
+        sizes = {
+            "base_angular_velocity": 3,
+            "projected_gravity": 3,
+            "joint_position": joints,
+            "joint_velocity": joints,
+            "base_position": 3,
+            "ball_position": 3,
+            "heading": 2,
+            "base_shift": 2,
+        }
+        amplitudes = [torch.full((size,), getattr(config, name)) for name, size in sizes.items()]
+        self._amplitude = torch.cat(amplitudes).to(device)
+        self._sensed = torch.zeros(num_worlds, self._amplitude.shape[0], device=device)
+        views = torch.split(self._sensed, list(sizes.values()), dim=1)
         self.base_angular_velocity, self.projected_gravity, self.joint_position, self.joint_velocity = views[:4]
         self.base_position, self.ball_position, self.heading, self.base_shift_noise = views[4:]
+        self.base_quat = torch.zeros(num_worlds, 4, device=device)
+        frames = max(2, math.ceil(self._high) + 1)
+        self._line = torch.zeros(num_worlds, frames, MOCAP_COLUMNS, device=device)
+        self._delay = torch.zeros(num_worlds, device=device)  # in control steps
+        self._seed = torch.zeros(num_worlds, dtype=torch.int32, device=device)
+        self._mask = torch.zeros(num_worlds, dtype=torch.bool, device=device)
+        self._bound: tuple[RobotState, Tensor] | None = None
 
     def update(self, robot: RobotState, ball_position: Tensor, new_ball: Tensor) -> None:
         """One control step later: sense the state; ``new_ball`` (N,) bool marks balls that were just launched."""
-        self._read(robot, ball_position)
-        for older in range(self._line.shape[0] - 1, 0, -1):
-            self._line[older].copy_(self._line[older - 1])
-        self._line[0].copy_(self._truth[:, self._mocap])
-        launched = new_ball.unsqueeze(-1)
-        for frame in self._line[1:]:
-            torch.where(launched, self._line[0, :, BALL], frame[:, BALL], out=frame[:, BALL])
-        self._add_delay_and_noise(self._sensed)
+        self._prepare(robot, ball_position, new_ball)
+        self._update()
 
     def reset(self, mask: Tensor, robot: RobotState, ball_position: Tensor) -> None:
         """Draw new delays for the worlds of ``mask`` (N,) bool and sense them as if they had stood still so far."""
-        wide = mask.unsqueeze(-1)
-        self._read(robot, ball_position)
-        delay = torch.rand(wide.shape, device=wide.device, generator=self._generator)
+        delay = torch.rand(mask.shape, device=mask.device, generator=self._generator)
         delay = delay.mul_(self._high - self._low).add_(self._low)
-        hat = (1.0 - (delay - self._steps_back).abs()).clamp_(min=0.0)  # linear interpolation
-        self._weight.copy_(torch.where(wide, hat, self._weight))
-        self._line.copy_(torch.where(wide, self._truth[:, self._mocap], self._line))
-        sensed = torch.empty_like(self._sensed)
-        self._add_delay_and_noise(sensed)
-        self._sensed.copy_(torch.where(wide, sensed, self._sensed))
+        self._delay.copy_(torch.where(mask, delay, self._delay))
+        self._prepare(robot, ball_position, mask)
+        self._reset()
 
-    def _read(self, robot: RobotState, ball_position: Tensor) -> None:
-        signals = (
-            robot.base_angular_velocity,
-            robot.projected_gravity,
-            robot.joint_position - self._nominal,
-            robot.joint_velocity,
-            robot.base_position,
-            ball_position,
-            robot.heading,
-        )
-        torch.cat(signals, dim=1, out=self._truth)
+    def _prepare(self, robot: RobotState, ball_position: Tensor, mask: Tensor) -> None:
+        if self._bound is None or self._bound[0] is not robot or self._bound[1] is not ball_position:
+            self._bind(robot, ball_position)
+        self._mask.copy_(mask)
+        self._seed.random_(generator=self._generator)
 
-    def _add_delay_and_noise(self, out: Tensor) -> None:
-        self._noise.uniform_(-1.0, 1.0, generator=self._generator)
-        torch.mul(self._noise, self._amplitude, out=out)
-        columns = self._mocap.start
-        out[:, :columns].add_(self._truth[:, :columns])
-        out[:, self._mocap].add_((self._weight * self._line).sum(0))
-
-
-def base_orientation(projected_gravity: Tensor, heading: Tensor) -> Tensor:
-    """Base quaternion (N, 4) w, x, y, z from gravity in the body frame (N, 3) and heading on the ground (N, 2).
-
-    Gravity gives roll and pitch, heading gives yaw (R = Rz Ry Rx); neither needs to have unit length.
-    """
-    x, y, z = projected_gravity.unbind(1)
-    roll = torch.atan2(-y, -z)
-    pitch = torch.atan2(x, torch.hypot(y, z))
-    yaw = torch.atan2(heading[:, 1], heading[:, 0])
-    half = 0.5 * torch.stack((roll, pitch, yaw))
-    (cr, cp, cy), (sr, sp, sy) = torch.cos(half), torch.sin(half)
-    quat = (
-        cr * cp * cy + sr * sp * sy,
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-    )
-    return torch.stack(quat, dim=1)
+    def _bind(self, robot: RobotState, ball_position: Tensor) -> None:
+        self._bound = (robot, ball_position)
+        truth = Truth()
+        truth.ball_position = share(ball_position)
+        for name in Truth.vars:  # type: ignore[attr-defined]
+            if name != "ball_position":
+                setattr(truth, name, share(getattr(robot, name)))
+        state = (self._nominal, self._delay, self._amplitude, self._line, self._sensed)
+        quat = wp.from_torch(self.base_quat, dtype=wp.vec4)
+        shared = [share(self._seed), truth, *(wp.from_torch(tensor) for tensor in state), quat]
+        mask = share(self._mask)
+        self._update = record(_sense, self._num_worlds, [mask, 0, *shared], self._device)
+        self._reset = record(_sense, self._num_worlds, [mask, 1, *shared], self._device)

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pace.config import RewardConfig, ServeConfig, TaskConfig, load_train_config
+from pace.config import TaskConfig, load_train_config
 from pace.rl.state import TaskState
 from pace.rl.task import Game
 from pace.sim.ball import BallEvents, Forecast
@@ -29,25 +29,35 @@ def config(*overrides: str) -> TaskConfig:
     return load_train_config(list(overrides))
 
 
-def fake_events(num_worlds: int = 1, **times: float | tuple[float, ...]) -> BallEvents:
+def set_events(events: BallEvents, **times: float | tuple[float, ...]) -> None:
     """Ball events of a step: keyword = kind, value = its time or times in the step, s; the same in all worlds."""
-    events = BallEvents.allocate(num_worlds, CPU)
+    for name, tensor in vars(events).items():
+        tensor.fill_(torch.inf if name.endswith("_time") else 0)
     for kind, given in times.items():
         given = given if isinstance(given, tuple) else (given,)
         getattr(events, kind).fill_(len(given))
         getattr(events, f"{kind}_time").fill_(min(given))
-    return events
 
 
-def fake_forecast(num_worlds: int = 1) -> Forecast:
+def set_serve(forecast: Forecast) -> None:
     """The forecast of a playable serve."""
-    forecast = Forecast.allocate(num_worlds, CPU)
     forecast.bounce_time.fill_(0.4)
     forecast.apex.copy_(torch.tensor([-1.4, 0.1, 1.1]))
     forecast.apex_time.fill_(0.6)
     forecast.intercept.copy_(torch.tensor([-1.6, 0.12, 1.05]))
     forecast.intercept_time.fill_(0.68)
-    return forecast
+
+
+def fake_ball(n: int) -> Any:
+    """A ball in mid-serve, without a physics; far from the paddle."""
+    forecast = Forecast.allocate(n, CPU)
+    set_serve(forecast)
+    return SimpleNamespace(
+        num_worlds=n, device=CPU, position=torch.tensor([0.5, 0.0, 1.1]).repeat(n, 1),
+        velocity=torch.tensor([-5.0, 0.1, 0.5]).repeat(n, 1), events=BallEvents.allocate(n, CPU),
+        forecast_result=forecast, nearest_paddle_distance=torch.ones(n),
+        params=SimpleNamespace(radius=torch.full((n,), 0.02)),
+    )  # fmt: skip
 
 
 def fake_robot(n: int) -> Any:
@@ -74,23 +84,25 @@ class FakeKinematics:
 
 
 def fake_worlds(n: int) -> Any:
-    """The attributes of :class:`pace.sim.worlds.Worlds` that the task reads; the ball is in mid-serve."""
-    ball = SimpleNamespace(
-        position=torch.tensor([0.5, 0.0, 1.1]).repeat(n, 1), velocity=torch.tensor([-5.0, 0.1, 0.5]).repeat(n, 1)
-    )
+    """The attributes of :class:`pace.sim.worlds.Worlds` that the task reads."""
     return SimpleNamespace(
-        num_worlds=n, device=CPU, control_dt=0.02, robot=fake_robot(n), ball=ball,
+        num_worlds=n, device=CPU, control_dt=0.02, robot=fake_robot(n), ball=fake_ball(n),
         nominal=torch.linspace(-0.5, 0.5, 21), joint_lower=torch.full((21,), -1.0),
-        joint_upper=torch.full((21,), 1.0), joint_names=JOINT_NAMES,
-        kinematics=FakeKinematics(),
+        joint_upper=torch.full((21,), 1.0), joint_names=JOINT_NAMES, kinematics=FakeKinematics(),
     )  # fmt: skip
 
 
-def fake_state(n: int = 1, reward: RewardConfig | None = None, serve: ServeConfig | None = None) -> TaskState:
+def fake_game(n: int = 1, task: TaskConfig | None = None) -> tuple[Game, Any]:
+    """A game in the middle of a playable serve, and its worlds."""
+    worlds = fake_worlds(n)
+    game = Game(task or config(), worlds.ball, worlds.robot.base_position)
+    game.start_serve(torch.ones(n, dtype=torch.bool))
+    return game, worlds
+
+
+def fake_state(n: int = 1, task: TaskConfig | None = None) -> TaskState:
     """A state in the middle of a playable serve."""
-    task = config()
-    game = Game(serve or task.serve, reward or task.reward, n, CPU)
-    game.start_serve(torch.ones(n, dtype=torch.bool), fake_forecast(n))
-    state = TaskState(fake_worlds(n), game, reward or task.reward)
+    game, worlds = fake_game(n, task)
+    state = TaskState(worlds, game)
     state.refresh()
     return state

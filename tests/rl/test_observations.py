@@ -16,13 +16,13 @@ from pace.rl.observations import (
     POLICY,
     ActorSignals,
     BallTrack,
-    CriticSignals,
     History,
     check_critic,
     check_policy,
     layout,
     predictor_slices,
 )
+from pace.rl.task import rules_of
 from pace.sim.sensing import Sensing
 from tests.rl.fakes import CPU, config, fake_state, fake_worlds
 
@@ -126,15 +126,10 @@ def fake_actor(task: TaskConfig, output: Tensor | None) -> ActorSignals:
         assert output is not None
         return output.repeat(positions.shape[0], 1)
 
-    actor = ActorSignals(
-        sensing,
-        worlds.kinematics,
-        worlds.nominal,
-        predict if output is not None else None,
-        task.reward,
-        task.predictor,
-        IDLE,
-    )
+    predictor, rule = predict if output is not None else None, task.reward.nothing_to_hit
+    action = torch.zeros(1, 21)
+    kinematics = worlds.kinematics
+    actor = ActorSignals(sensing, kinematics, worlds.nominal, action, predictor, task.predictor, rule, rules_of(task))
     for x in (0.7, 0.6, 0.5):
         actor.track.update(torch.tensor([[x, 0.0, 1.1]]), torch.tensor([x == 0.7]))
     return actor
@@ -185,18 +180,22 @@ def test_without_a_predictor_its_quantities_are_zero() -> None:
 
 def test_critic_sees_the_forecast_or_the_place_to_stand_by() -> None:
     state = fake_state()
-    critic = CriticSignals(state, config().reward)
     state.game.clock.time.fill_(0.1)
-    critic.compute()
-    torch.testing.assert_close(critic.apex, state.game.target.apex)
-    assert float(critic.time) == pytest.approx(0.58)
-    torch.testing.assert_close(critic.shift, torch.tensor([[0.1, 0.42]]))
+    state.derive()
+    torch.testing.assert_close(state.apex, state.game.target.apex)
+    assert float(state.arrival) == pytest.approx(0.58)
+    torch.testing.assert_close(state.shift, torch.tensor([[0.1, 0.42]]))
     state.ball.velocity[:, 0] = 2.0
-    state.refresh()
-    critic.compute()
-    torch.testing.assert_close(critic.apex[0], IDLE)
-    assert float(critic.time) == 0.0
-    torch.testing.assert_close(critic.shift, torch.tensor([[0.0, 0.0]]))
+    state.derive()
+    torch.testing.assert_close(state.apex[0], IDLE)
+    assert float(state.arrival) == 0.0
+    torch.testing.assert_close(state.shift, torch.tensor([[0.0, 0.0]]))
+
+
+def test_critics_shift_of_the_paper_is_that_of_the_apex() -> None:
+    state = fake_state(1, config("reward=paper"))
+    torch.testing.assert_close(state.shift, torch.tensor([[0.3, 0.4]]))  # apex (-1.4, 0.1)
+    torch.testing.assert_close(state.base_error, torch.tensor([[0.1, 0.4]]))  # x clamped to -1.6
 
 
 # --- the whole environment --------------------------------------------------------------------------------------------

@@ -13,9 +13,10 @@ import torch
 from pace.config import ConfigError, RewardConfig, RewardTerm
 from pace.rl.rewards import TERMS, RewardFunction, RewardManager
 from pace.rl.state import TaskState
-from tests.rl.fakes import CPU, JOINT_NAMES, config, fake_events, fake_state
+from tests.rl.fakes import CPU, JOINT_NAMES, config, fake_state, set_events
 
-PAPER = config("reward=paper").reward
+PAPER_TASK = config("reward=paper")
+PAPER = PAPER_TASK.reward
 PACE = config().reward
 
 
@@ -29,13 +30,14 @@ def value(name: str, state: TaskState, reward: RewardConfig = PAPER) -> float:
 def hit(state: TaskState, distance: float = 0.0275) -> None:
     """A legal hit at ``distance`` of the ball's centre from the face's centre."""
     for times in ({"own_bounce": 0.01}, {"paddle_hit": 0.01}):
-        play(state, distance, False, **times)
+        play(state, distance, **times)
 
 
-def play(state: TaskState, distance: float, due: bool = False, **times: Any) -> None:
-    state.game.referee.judge(fake_events(1, **times), state.game.clock.time, state.ball.position[:, 0])
-    state.game.closeness.update(state.game.referee, torch.tensor([distance - 0.02]), torch.tensor([due]))
-    state.game.referee.close(torch.zeros(1, dtype=torch.bool), torch.zeros(1, dtype=torch.bool), state.game.returns)
+def play(state: TaskState, distance: float, **times: Any) -> None:
+    set_events(state.ball.events, **times)
+    state.ball.nearest_paddle_distance.fill_(distance)
+    state.game.judge()
+    state.game.close()
 
 
 def test_every_term_of_the_paper_is_there_and_every_term_is_tested() -> None:
@@ -44,7 +46,7 @@ def test_every_term_of_the_paper_is_there_and_every_term_is_tested() -> None:
 
 
 def test_paddle_to_target() -> None:
-    state = fake_state(reward=PAPER)
+    state = fake_state(1, PAPER_TASK)
     state.robot.paddle_position.copy_(state.game.target.point + torch.tensor([0.0, 0.3, 0.4]))
     assert value("paddle_to_target", state) == pytest.approx(math.exp(-0.5 / 0.25))
     state.robot.paddle_position.copy_(state.game.target.point)
@@ -54,14 +56,14 @@ def test_paddle_to_target() -> None:
 
 
 def test_base_to_target() -> None:
-    state = fake_state(reward=PAPER)  # target (-1.6, 0.1): base target (-1.7, 0.7), base (-1.8, 0.3)
+    state = fake_state(1, PAPER_TASK)  # target (-1.6, 0.1): base target (-1.7, 0.7), base (-1.8, 0.3)
     assert value("base_to_target", state) == pytest.approx(math.exp(-math.hypot(0.1, 0.4) / 0.25))
     state.ball.velocity[:, 0] = 3.0  # nothing to hit: the base stands on its idle place
     assert value("base_to_target", state) == pytest.approx(math.exp(-0.05 / 0.25))
 
 
 def test_base_velocity() -> None:
-    state = fake_state(reward=PAPER)  # wanted 4 * (0.1, 0.4)
+    state = fake_state(1, PAPER_TASK)  # wanted 4 * (0.1, 0.4)
     state.robot.base_linear_velocity[:] = torch.tensor([0.4, 0.6, 5.0])
     assert value("base_velocity", state) == pytest.approx(math.exp(-1.0 / 1.44))
     state.robot.base_position[:, 1] = -9.0
@@ -79,7 +81,7 @@ def test_contact_pays_the_best_closeness_once() -> None:
         (0.0275, {"paddle_hit": 0.01}),
         (0.02, {}),
     ):
-        play(state, distance, False, **times)
+        play(state, distance, **times)
         paid.append(value("contact", state))
     assert paid == pytest.approx([0.0, 0.2, 0.0, 0.65, 0.0], abs=1e-5)
     assert sum(paid) == pytest.approx((0.05 - 0.0075) / 0.05)
@@ -98,9 +100,10 @@ def test_arrival_is_paid_when_the_ball_is_due_or_hit() -> None:
     play(state, 0.5, own_bounce=0.01)
     play(state, 0.17)
     assert value("arrival", state, PACE) == 0.0
-    play(state, 0.32, due=True)
+    state.game.clock.time.fill_(0.68)
+    play(state, 0.32)
     assert value("arrival", state, PACE) == pytest.approx(math.exp(-0.15 / 0.15), rel=1e-5)
-    play(state, 0.1, due=True)
+    play(state, 0.1)
     assert value("arrival", state, PACE) == 0.0
     early = fake_state()
     hit(early)
@@ -296,7 +299,8 @@ def test_a_wrong_shape_names_the_term(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_all_terms_are_finite_at_the_start_of_a_serve_and_without_one() -> None:
     state = fake_state(3)
-    state.game.referee.start(torch.ones(3, dtype=torch.bool), torch.tensor([True, False, True]))
+    state.ball.forecast_result.bounce_time[1] = torch.nan
+    state.game.start_serve(torch.ones(3, dtype=torch.bool))
     manager = RewardManager(PACE, 3, CPU, 0.02)
     state.refresh()
     manager.compute(state)

@@ -8,22 +8,10 @@ from typing import Any
 import pytest
 import torch
 
-from pace.rl.task import (
-    Closeness,
-    Outcome,
-    PoseSampler,
-    Referee,
-    ReturnForecast,
-    ServeClock,
-    ServeSampler,
-    Target,
-    lost_position,
-    nothing_to_hit,
-)
-from tests.rl.fakes import CPU, JOINT_NAMES, config, fake_events, fake_forecast
+from pace.rl.task import Outcome, PoseSampler, ServeSampler
+from tests.rl.fakes import CPU, JOINT_NAMES, config, fake_game, set_events
 
 YES = torch.ones(1, dtype=torch.bool)
-NO = torch.zeros(1, dtype=torch.bool)
 BOUNCE: dict[str, Any] = {"own_bounce": 0.010}
 HIT: dict[str, Any] = {"paddle_hit": 0.005}
 
@@ -31,23 +19,31 @@ HIT: dict[str, Any] = {"paddle_hit": 0.005}
 class Serve:
     """One serve in one world, told as the events of its control steps."""
 
-    def __init__(self, playable: bool = True) -> None:
-        self.referee = Referee(1, CPU)
-        self.referee.start(YES, torch.tensor([playable]))
-        self.time = 0.0
+    def __init__(self, playable: bool = True, *overrides: str) -> None:
+        self.game, worlds = fake_game(1, config(*(overrides or ("serve=mixed",))))
+        self.ball, self.robot = worlds.ball, worlds.robot
+        self.referee, self.ends, self.closeness = self.game.referee, self.game.ends, self.game.closeness
+        if not playable:
+            self.ball.forecast_result.bounce_time.fill_(torch.nan)
+            self.game.start_serve(YES)
         self.successes = 0
 
-    def step(self, x: float = -1.0, **times: Any) -> Serve:
-        self.referee.judge(fake_events(1, **times), torch.tensor([self.time]), torch.tensor([x]))
-        self.time += 0.02
-        self.close(over=False)
-        return self
-
-    def close(self, over: bool = True, fallen: bool = False, returns: ReturnForecast | None = None) -> Serve:
-        returns = returns or ReturnForecast(1, CPU)
-        self.referee.close(torch.tensor([over]), torch.tensor([fallen]), returns)
+    def step(self, x: float = -1.0, distance: float = 1.0, **times: Any) -> Serve:
+        self.ball.position[:, 0] = x
+        self.ball.nearest_paddle_distance.fill_(distance + 0.02)
+        set_events(self.ball.events, **times)
+        self.game.judge()
+        self.game.close()
         self.successes += int(self.referee.success_now)
         return self
+
+    def end(self, fallen: bool = False) -> Serve:
+        """Time is up, or the robot falls."""
+        if fallen:
+            self.robot.base_position[:, 2] = 0.3
+        else:
+            self.game.clock.time.fill_(1.8)
+        return self.step()
 
     @property
     def outcome(self) -> Outcome:
@@ -66,7 +62,7 @@ def test_a_valid_return_is_a_hit_and_one_success() -> None:
     assert float(serve.referee.touch_time) == pytest.approx(0.025)
     serve.step(x=1.0, opponent_bounce=0.01)
     assert serve.outcome == Outcome.SUCCESS
-    serve.step(x=1.3, opponent_bounce=0.01).step(x=2.0, floor=0.01).close()
+    serve.step(x=1.3, opponent_bounce=0.01).step(x=2.0, floor=0.01).end()
     assert serve.outcome == Outcome.SUCCESS
     assert serve.successes == 1
 
@@ -113,8 +109,7 @@ def test_outcomes(steps: list[dict[str, Any]], outcome: Outcome, hit: bool) -> N
         serve.step(**step)
     assert serve.outcome == outcome
     assert serve.hit is hit
-    serve.close()
-    assert serve.outcome == outcome
+    assert serve.end().outcome == outcome
 
 
 @pytest.mark.parametrize(
@@ -150,16 +145,18 @@ def test_net_before_the_hit_does_not_count_against_the_robot() -> None:
 
 def test_rim_hits_are_marked() -> None:
     serve = Serve().step(**BOUNCE)
-    events = fake_events(1, **HIT)
-    events.hit_rim.fill_(True)
-    serve.referee.judge(events, torch.tensor([0.1]), torch.tensor([-1.0]))
+    set_events(serve.ball.events, **HIT)
+    serve.ball.events.hit_rim.fill_(True)
+    serve.game.judge()
     assert bool(serve.referee.rim)
 
 
 def test_no_contact_is_a_miss_at_the_end_of_the_serve() -> None:
     serve = Serve().step(**BOUNCE).step()
     assert serve.outcome == Outcome.OPEN
-    assert serve.close().outcome == Outcome.MISS
+    assert serve.end().outcome == Outcome.MISS
+    assert serve.ends.over
+    assert serve.ends.next_serve
 
 
 @pytest.mark.parametrize(
@@ -174,65 +171,69 @@ def test_no_contact_is_a_miss_at_the_end_of_the_serve() -> None:
 def test_a_flight_cut_off_by_the_clock_is_decided_by_its_forecast(
     own: bool, opponent: bool, x: float, outcome: Outcome
 ) -> None:
-    returns = ReturnForecast(1, CPU)
-    returns.lands_own.fill_(own)
-    returns.lands_opponent.fill_(opponent)
-    returns.landing.fill_(x)
-    serve = Serve().step(**BOUNCE).step(**HIT)
-    assert serve.close(returns=returns).outcome == outcome
+    serve = Serve().step(**BOUNCE)
+    forecast = serve.ball.forecast_result
+    forecast.landing_own.fill_(own)
+    forecast.landing_opponent.fill_(opponent)
+    forecast.landing.fill_(x)
+    serve.step(**HIT)
+    assert serve.outcome == Outcome.OPEN
+    assert serve.end().outcome == outcome
     assert serve.successes == int(outcome == Outcome.SUCCESS)
 
 
 def test_a_fall_decides_an_open_serve_only() -> None:
-    assert Serve().step(**BOUNCE).close(over=False, fallen=True).outcome == Outcome.FALL
+    fallen = Serve().step(**BOUNCE).end(fallen=True)
+    assert fallen.outcome == Outcome.FALL
+    assert fallen.ends.lost
+    assert not fallen.ends.next_serve
     decided = Serve().step(**BOUNCE).step(**HIT).step(opponent_bounce=0.01)
-    assert decided.close(over=False, fallen=True).outcome == Outcome.SUCCESS
+    assert decided.end(fallen=True).outcome == Outcome.SUCCESS
 
 
 def test_a_serve_that_never_bounces_is_nobodys_fault() -> None:
-    serve = Serve(playable=False).step(**HIT).step(floor=0.01).close()
+    serve = Serve(playable=False).step(**HIT).step(floor=0.01).end()
     assert serve.outcome == Outcome.BAD_SERVE
     assert not serve.hit
 
 
 def test_a_new_serve_starts_clean_and_only_where_asked() -> None:
-    referee = Referee(2, CPU)
-    both = torch.ones(2, dtype=torch.bool)
-    referee.start(both, both)
+    game, worlds = fake_game(2)
     for times in (BOUNCE, HIT):
-        referee.judge(fake_events(2, **times), torch.zeros(2), torch.zeros(2))
-    first = torch.tensor([True, False])
-    referee.start(first, both)
-    assert referee.hit.tolist() == [False, True]
-    assert referee.own_bounces.tolist() == [0, 1]
-    assert referee.touch_time.tolist() == [math.inf, pytest.approx(0.005)]
+        set_events(worlds.ball.events, **times)
+        game.judge()
+        game.close()
+    game.start_serve(torch.tensor([True, False]))
+    assert game.referee.hit.tolist() == [False, True]
+    assert game.referee.own_bounces.tolist() == [0, 1]
+    assert game.referee.touch_time.tolist() == [math.inf, pytest.approx(0.025)]
+    assert game.clock.time.tolist() == [0.0, pytest.approx(0.04)]
 
 
 def test_intercept_and_clamp_targets() -> None:
-    forecast = fake_forecast(1)
-    intercept = Target(config().reward, 1, CPU)
-    intercept.aim(YES, forecast)
-    torch.testing.assert_close(intercept.point, forecast.intercept)
-    assert float(intercept.time) == pytest.approx(0.68)
-    clamp = Target(config("reward=paper").reward, 1, CPU)
-    clamp.aim(YES, forecast)
-    torch.testing.assert_close(clamp.point, torch.tensor([[-1.6, 0.1, 1.1]]))
-    torch.testing.assert_close(clamp.apex, forecast.apex)
-    assert float(clamp.time) == pytest.approx(0.6)
+    game, worlds = fake_game()
+    torch.testing.assert_close(game.target.point, worlds.ball.forecast_result.intercept)
+    assert float(game.target.time) == pytest.approx(0.68)
+    game, worlds = fake_game(1, config("reward=paper"))
+    torch.testing.assert_close(game.target.point, torch.tensor([[-1.6, 0.1, 1.1]]))
+    torch.testing.assert_close(game.target.apex, worlds.ball.forecast_result.apex)
+    assert float(game.target.time) == pytest.approx(0.6)
 
 
 def test_targets_have_no_nan() -> None:
-    forecast = fake_forecast(2)
+    game, worlds = fake_game(2)
+    forecast = worlds.ball.forecast_result
     forecast.bounce_time[0] = torch.nan
     forecast.apex[0] = torch.nan
     forecast.intercept[:] = torch.nan
     forecast.intercept_time[:] = torch.nan
-    target = Target(config().reward, 2, CPU)
-    target.aim(torch.ones(2, dtype=torch.bool), forecast)
+    game.start_serve(torch.ones(2, dtype=torch.bool))
+    target = game.target
     assert target.playable.tolist() == [False, True]
     torch.testing.assert_close(target.point[0], torch.tensor([-1.7, -0.3, 1.0]))  # to stand by
     torch.testing.assert_close(target.point[1], forecast.apex[1])  # never passes target_x: the apex
     assert float(target.time[1]) == pytest.approx(0.6)
+    assert target.something_to_hit.tolist() == [False, True]
 
 
 @pytest.mark.parametrize(
@@ -247,43 +248,40 @@ def test_targets_have_no_nan() -> None:
     ],
 )
 def test_nothing_to_hit(position: tuple[float, ...], velocity: tuple[float, ...], expected: bool) -> None:
-    rule = config("reward=paper").reward.nothing_to_hit
-    result = nothing_to_hit(torch.tensor([position]), torch.tensor([velocity]), rule)
-    assert bool(result) is expected
+    serve = Serve()
+    serve.ball.position.copy_(torch.tensor([position]))
+    serve.ball.velocity.copy_(torch.tensor([velocity]))
+    serve.game.close()
+    assert bool(serve.game.target.something_to_hit) is not expected
+
+
+def test_nothing_to_hit_after_a_contact() -> None:
+    serve = Serve().step(**BOUNCE)
+    assert serve.game.target.something_to_hit
+    assert not serve.step(**HIT).game.target.something_to_hit
+    assert not Serve().step(**HIT).game.target.something_to_hit
 
 
 def test_closeness_counts_only_while_the_ball_can_be_hit() -> None:
-    referee, closeness = Referee(1, CPU), Closeness(1, CPU)
-    referee.start(YES, YES)
-    closeness.start(YES)
-
-    def step(distance: float, due: bool = False, **times: Any) -> None:
-        referee.judge(fake_events(1, **times), torch.zeros(1), torch.zeros(1))
-        closeness.update(referee, torch.tensor([distance]), torch.tensor([due]))
-
-    step(0.1)  # before the bounce
+    serve = Serve().step(distance=0.1)  # before the bounce
+    closeness = serve.closeness
     assert float(closeness.nearest) == math.inf
-    step(0.5, **BOUNCE)
-    step(0.3)
-    step(0.4)
+    serve.step(distance=0.5, **BOUNCE).step(distance=0.3).step(distance=0.4)
     assert float(closeness.nearest) == pytest.approx(0.3)
-    step(0.35, due=True)
+    serve.game.clock.time.fill_(0.68)
+    serve.step(distance=0.35)
     assert bool(closeness.arrived_now)
-    step(0.008, due=True, **HIT)
+    serve.step(distance=0.008, **HIT)
     assert not bool(closeness.arrived_now)  # once a serve
     assert float(closeness.nearest) == pytest.approx(0.008)
-    step(0.001, due=True)  # after the hit
+    serve.step(distance=0.001)  # after the hit
     assert float(closeness.nearest) == pytest.approx(0.008)
 
 
 def test_an_early_hit_is_an_arrival() -> None:
-    referee, closeness = Referee(1, CPU), Closeness(1, CPU)
-    referee.start(YES, YES)
-    closeness.start(YES)
-    for times in (BOUNCE, HIT):
-        referee.judge(fake_events(1, **times), torch.zeros(1), torch.zeros(1))
-        closeness.update(referee, torch.tensor([0.01]), NO)
-    assert bool(closeness.arrived_now)
+    serve = Serve().step(distance=0.01, **BOUNCE)
+    assert not bool(serve.closeness.arrived_now)
+    assert bool(serve.step(distance=0.01, **HIT).closeness.arrived_now)
 
 
 def test_serves_are_drawn_in_range() -> None:
@@ -336,19 +334,27 @@ def test_poses_are_drawn_in_range_and_within_joint_limits() -> None:
     ],
 )
 def test_serves_end(time: float, z: float, floor: int, touch: float, over: bool) -> None:
-    clock = ServeClock(config().serve, 1, CPU)
-    clock.time.fill_(time)
-    result = clock.over(torch.tensor([z]), torch.tensor([floor]), torch.tensor([touch]))
-    assert bool(result) is over
+    serve = Serve(True, "serve=train")
+    serve.game.clock.time.fill_(time - 0.02)
+    serve.ball.position[:, 2] = z
+    serve.referee.touch_time.fill_(touch)
+    serve.referee.touched.fill_(touch < 9.0)
+    set_events(serve.ball.events, **({"floor": 0.01} if floor else {}))
+    serve.game.judge()
+    serve.game.close()
+    assert bool(serve.ends.over) is over
 
 
 def test_episodes_count_five_serves_and_first_ones_start_anywhere() -> None:
-    clock = ServeClock(config().serve, 1000, CPU)
+    game, worlds = fake_game(1000)
+    clock = game.clock
     everyone = torch.ones(1000, dtype=torch.bool)
     generator = torch.Generator().manual_seed(0)
     clock.start_episode(everyone, generator)
     assert set(clock.index.tolist()) == {0.0, 1.0, 2.0, 3.0, 4.0}
-    torch.testing.assert_close(clock.last_serve(), clock.index == 4)
+    worlds.ball.position[:, 2] = 0.05
+    game.close()
+    torch.testing.assert_close(game.ends.truncated, clock.index == 4)
     clock.start_episode(everyone, generator)
     assert not clock.index.any()
     clock.finish(everyone)
@@ -357,16 +363,21 @@ def test_episodes_count_five_serves_and_first_ones_start_anywhere() -> None:
 
 
 def test_endless_play_has_no_last_serve() -> None:
-    clock = ServeClock(config("serve=mixed").serve, 3, CPU)
-    clock.start_episode(torch.ones(3, dtype=torch.bool), torch.Generator())
-    assert not clock.index.any()
-    clock.index.fill_(1000.0)
-    assert not clock.last_serve().any()
-    assert not clock.episode_progress.any()
+    game, worlds = fake_game(3, config("serve=mixed"))
+    game.clock.start_episode(torch.ones(3, dtype=torch.bool), torch.Generator())
+    assert not game.clock.index.any()
+    game.clock.index.fill_(1000.0)
+    worlds.ball.position[:, 2] = 0.05
+    game.close()
+    assert game.ends.over.all()
+    assert not game.ends.truncated.any()
+    assert not game.clock.episode_progress.any()
 
 
 def test_lost_positions() -> None:
-    positions = torch.tensor(
-        [[-1.8, 0.0, 0.7], [-1.8, 0.0, 0.49], [-3.7, 0.0, 0.7], [-1.3, 0.0, 0.7], [-1.8, 1.2, 0.7], [-1.8, -1.2, 0.7]]
-    )
-    assert lost_position(positions, config().reset).tolist() == [False, True, True, True, True, True]
+    game, worlds = fake_game(6)
+    standing, fallen, far = [-1.8, 0.0, 0.7], [-1.8, 0.0, 0.49], [-3.7, 0.0, 0.7]
+    near, left, right = [-1.3, 0.0, 0.7], [-1.8, 1.2, 0.7], [-1.8, -1.2, 0.7]
+    worlds.robot.base_position.copy_(torch.tensor([standing, fallen, far, near, left, right]))
+    game.close()
+    assert game.ends.lost.tolist() == [False, True, True, True, True, True]

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pace.config import SensingConfig
-from pace.sim.sensing import Sensing, base_orientation
+from pace.sim.sensing import Sensing
 from tests.rl.fakes import CPU, config, fake_robot
 
 DT = 0.02
@@ -119,5 +119,8 @@ def test_orientation_from_gravity_and_heading(roll: float, pitch: float, yaw: fl
     w, x, y, z = expected
     gravity = torch.tensor([[2 * (w * y - x * z), -2 * (y * z + w * x), 2 * (x * x + y * y) - 1]])
     heading = torch.tensor([[1 - 2 * (y * y + z * z), 2 * (x * y + w * z)]])
-    quat = base_orientation(1.3 * gravity, 0.8 * heading)
-    torch.testing.assert_close(quat, torch.tensor([expected]), atol=1e-6, rtol=0)
+    sensing, robot = make(clean(0.0, 0.0)), fake_robot(4)
+    robot.projected_gravity.copy_(1.3 * gravity)  # noise leaves neither of unit length
+    robot.heading.copy_(0.8 * heading)
+    sensing.reset(ALL, robot, ball_at(1.0))
+    torch.testing.assert_close(sensing.base_quat, torch.tensor([expected]).repeat(4, 1), atol=1e-6, rtol=0)

@@ -1,0 +1,87 @@
+"""What the robot computes from its sensors, as Warp kernels, one thread a world. See :mod:`pace.rl.observations`."""
+
+import warp as wp
+
+from pace.rl.task_kernels import LONGEST_TIME, Rules, clamp_x, nothing_to_hit
+
+
+@wp.func
+def _position(positions: wp.array[wp.float32], start: int) -> wp.vec3:
+    return wp.vec3(positions[start], positions[start + 1], positions[start + 2])
+
+
+@wp.kernel
+def follow_ball(
+    mask: wp.array[wp.bool],
+    advance: int,
+    sensed: wp.array[wp.vec3],
+    positions: wp.array2d[wp.float32],
+    turned: wp.array[wp.bool],
+    something_to_hit: wp.array[wp.bool],
+    rules: Rules,
+):
+    """Append a sensed position, oldest first. Masked worlds have a new ball; the others keep theirs if not advance."""
+    world = wp.tid()
+    row = positions[world]
+    newest = row.shape[0] - 3
+    if not mask[world] and advance == 0:
+        return
+    for i in range(newest):
+        if mask[world]:
+            row[i] = sensed[world][i % 3]
+        else:
+            row[i] = row[i + 3]
+    for i in range(3):
+        row[newest + i] = sensed[world][i]
+    # over two steps: noise matters less; only its sign is used
+    change = _position(row, newest) - _position(row, newest - 6)
+    gone = change[0] > 0.0 or (turned[world] and not mask[world])
+    turned[world] = gone
+    something_to_hit[world] = not (gone or nothing_to_hit(_position(row, newest), change, rules))
+
+
+@wp.struct
+class PredictionLayout:
+    """First columns of the parts of the predictor's output; negative where it has no such part."""
+
+    apex: int
+    target: int
+    time: int
+
+
+@wp.kernel
+def read_prediction(
+    prediction: wp.array2d[wp.float32],
+    layout: PredictionLayout,
+    something_to_hit: wp.array[wp.bool],
+    base_position: wp.array[wp.vec3],
+    shift_noise: wp.array[wp.vec2],
+    rules: Rules,
+    apex: wp.array[wp.vec3],
+    target: wp.array[wp.vec3],
+    time: wp.array[wp.float32],
+    shift: wp.array[wp.vec2],
+):
+    """Apex, target, time and base shift from the predictor's output; the point to stand by with nothing to hit."""
+    world = wp.tid()
+    row = prediction[world]
+    goal_apex = rules.idle_point
+    goal = rules.idle_point
+    left = 0.0
+    stand = rules.idle_base
+    if something_to_hit[world]:
+        goal_apex = _position(row, layout.apex)
+        goal = clamp_x(goal_apex, rules.target_x)
+        if layout.target >= 0:
+            goal = _position(row, layout.target)
+        if layout.time >= 0:
+            left = wp.clamp(row[layout.time], 0.0, LONGEST_TIME)
+        above = goal_apex
+        if rules.intercept == 1:
+            above = goal
+        stand = wp.vec2(above[0], above[1]) + rules.arm_offset
+    apex[world] = goal_apex
+    target[world] = goal
+    time[world] = left
+    base = base_position[world]
+    shift[world] = stand - wp.vec2(base[0], base[1]) + shift_noise[world]

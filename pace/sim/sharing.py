@@ -1,0 +1,32 @@
+"""Torch tensors as Warp arrays on the same memory, and recorded launches among torch's own kernels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+
+def share(tensor: Tensor) -> wp.array:
+    """The Warp array on a tensor's memory; rows (N, 3) are vectors. Keep the tensor alive."""
+    rows = tensor.dtype == torch.float32 and tensor.dim() == 2 and tensor.shape[1] == 3
+    return wp.from_torch(tensor, dtype=wp.vec3 if rows else None)
+
+
+def share_all(arrays: type, tensors: Mapping[str, Tensor]) -> Any:
+    """A Warp struct whose arrays lie on the memory of the tensors of the same names."""
+    struct = arrays()
+    for name, variable in arrays.vars.items():  # type: ignore[attr-defined]
+        setattr(struct, name, wp.from_torch(tensors[name], dtype=variable.type.dtype))
+    return struct
+
+
+def record(kernel: wp.Kernel, num_worlds: int, inputs: list[Any], device: torch.device) -> Callable[[], None]:
+    """A launch over N worlds that is only replayed when called, on torch's current stream."""
+    launch = wp.launch(kernel, dim=num_worlds, inputs=inputs, device=wp.device_from_torch(device), record_cmd=True)
+    if device.type == "cuda":
+        return lambda: launch.launch(stream=wp.stream_from_torch(torch.cuda.current_stream(device)))
+    return launch.launch
