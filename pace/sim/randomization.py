@@ -64,7 +64,6 @@ class Randomizer:
         sample = torch.rand(shape, device=self.actuator_delay.device, generator=self._generator)
         return sample.mul_(bounds[1] - bounds[0]).add_(bounds[0])
 
-
     def draw(self, mask: Tensor) -> None:
         """Draw new parameters for the worlds of ``mask`` (N,) bool."""
         for name in ENGINE_DRAWS:

@@ -16,22 +16,25 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pace.config import load_train_config
 from pace.sim import reference
 from pace.sim.ball import BallParams, BallSim, Forecast, ball_preset
 from pace.sim.rebound import Material, rebound
+from pace.sim.trials import (
+    BALL_DT,
+    PRESETS,
+    fitted_drag,
+    forecast_errors,
+    frame_difference,
+    make_sim,
+    phase_spread,
+    put,
+    recorded_flights,
+    true_drag,
+)
 
-CONTROL_DT = 0.02  # s
-BALL_DT = load_train_config().engine.ball_dt  # s
-PRESETS = ("paper", "standard", "venue", "rubber")
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")  # told apart by all kinds of colour vision
 SERVE = ([1.35, 0.0, 1.03], [-5.75, 0.0, 1.75])
 RETURN = ([-1.6, 0.0, 1.0], [5.5, 0.0, 2.2])
-
-
-def make_sim(num_worlds: int, params: BallParams, ball_dt: float = BALL_DT) -> BallSim:
-    """Worlds on the CPU, with the table of the presets."""
-    return BallSim(num_worlds, "cpu", params, ball_preset("paper").table, CONTROL_DT, 2, ball_dt)
 
 
 def resting_path(num_worlds: int, centre: tuple[float, float, float]) -> Tensor:
@@ -42,18 +45,12 @@ def resting_path(num_worlds: int, centre: tuple[float, float, float]) -> Tensor:
     return path
 
 
-def put(sim: BallSim, position: object, velocity: object, spin: object = (0.0, 0.0, 0.0)) -> None:
-    """Set all balls; rows broadcast."""
-    for target, value in ((sim.position, position), (sim.velocity, velocity), (sim.spin, spin)):
-        target.copy_(torch.as_tensor(np.asarray(value), dtype=torch.float32).expand_as(target))
-
-
 def forecast_serves(serves: reference.ServeBatch, ball_dt: float) -> Forecast:
     """The forecast of the reference's serves."""
     given = {f.name: torch.tensor(getattr(serves.ball, f.name)) for f in fields(serves.ball)}
     params = BallParams(**given, paddle_restitution=0.8, paddle_restitution_slope=0.0, paddle_friction=0.3)
     count = len(serves.position)
-    sim = make_sim(count, params, ball_dt)
+    sim = make_sim(count, params, ball_dt=ball_dt)
     start = [torch.tensor(a, dtype=torch.float32) for a in (serves.position, serves.velocity, serves.spin)]
     sim.forecast(torch.ones(count, dtype=torch.bool), start[0], start[1], start[2], -1.6)
     return sim.forecast_result
@@ -171,6 +168,26 @@ def print_presets() -> None:
         print(f"{preset}: " + ", ".join(f"{float(v):.3f}" for v in values) + f"; {float(out):.2f}")
 
 
+def print_checks() -> None:
+    """Strikes in other frames and phases, drag found back, and the forecast held against the flight."""
+    print("\nstrikes by a swinging paddle seen from another frame: change of the velocity over the speed; of the spin")
+    for velocity, yaw in (((5.0, -3.0, 4.0), 0.0), ((0.0, 0.0, 0.0), 1.1), ((-9.0, 6.0, 0.0), -2.0)):
+        share, spin = frame_difference(velocity, yaw)
+        print(f"moving at {velocity} m/s, turned by {yaw} rad: {share:.1e}, {spin:.2f} rad/s")
+    print("one strike at 200 phases of a control step: spread of velocity and spin after it, over their sizes")
+    for substeps in (2, 4, 10):
+        share, spin = phase_spread(substeps)
+        print(f"path known every {20 / substeps:g} ms: {share:.1e}, {spin:.1e}")
+    print("drag found back from 22 flights of 20 frames (paper's ball)")
+    for noise in (0.0, 0.001):
+        error = fitted_drag(recorded_flights(22, 20, noise)) / true_drag("paper") - 1
+        print(f"noise {1e3 * noise:g} mm: k off by {100 * error:+.3f} %")
+    print("forecast against flight, 300 returns: largest error of the landing's time and place")
+    for preset in PRESETS:
+        times, places = forecast_errors(preset)
+        print(f"{preset}: {1e6 * times.max():.0f} μs, {1e3 * places.max():.3f} mm")
+
+
 def print_speed(num_worlds: int = 1024) -> None:
     """The least of several timings of a control step over a serve, and of a forecast in all worlds."""
     params = BallParams.preset("rubber")
@@ -211,6 +228,7 @@ def main() -> None:
             figure.savefig(out / f"{name}.png", dpi=90)
             print(f"wrote {out / name}.png")
     print_presets()
+    print_checks()
     print_speed()
 
 

@@ -199,11 +199,15 @@ class Worlds:
         self.ball.fly(self.kinematics.paddle_path)
 
     def _react(self) -> None:
-        """Spread the ball's last impulse on the paddle over the coming control step, at the same point of the blade."""
+        """Spread the ball's last impulse on the paddle over the coming control step.
+
+        A hit acts at the same place of the blade, which has moved on since; a contact that goes on (a ball that rests
+        on the blade) acts where it ended, at the end of the step.
+        """
         events = self.ball.events
-        arm = events.hit_offset - events.hit_normal * self.config.ball.radius
-        force = events.paddle_impulse / self.control_dt
-        self.kinematics.paddle_generalized_force(force, self.robot.paddle_position + arm, self._applied)
+        on_blade = self.robot.paddle_position + events.hit_offset + (events.hit_point - events.hit_position)
+        point = torch.where((events.paddle_hit > 0).unsqueeze(-1), on_blade, events.impulse_point)
+        self.kinematics.paddle_generalized_force(events.paddle_impulse / self.control_dt, point, self._applied)
 
     def _observe(self) -> None:
         self.kinematics.update(self.engine.qpos_path, self.engine.qvel_path)
@@ -229,7 +233,8 @@ class Worlds:
     def serve(self, mask: Tensor, position: Tensor, velocity: Tensor, spin: Tensor) -> None:
         """Start the ball of the worlds of ``mask`` at position (N, 3) m, velocity (N, 3) m/s, spin (N, 3) rad/s."""
         wide = mask.unsqueeze(-1)
-        for target, value in zip((self.ball.position, self.ball.velocity, self.ball.spin), (position, velocity, spin)):
+        states = (self.ball.position, self.ball.velocity, self.ball.spin)
+        for target, value in zip(states, (position, velocity, spin), strict=True):
             target.copy_(torch.where(wide, value, target))
 
     def state_dict(self) -> dict[str, Tensor]:

@@ -12,6 +12,7 @@ from torch import Tensor
 from pace.predictor import Forecast, forecast_flight
 from pace.sim import reference
 from pace.sim.ball import BallParams, BallSim, ball_preset
+from pace.sim.trials import far_path, first_contacts, random_returns
 
 DT = 0.02
 TABLE = ball_preset("rubber").table
@@ -23,22 +24,6 @@ G = 9.81
 def rows(*values: list[float]) -> Tensor:
     """(N, 3) float32."""
     return torch.tensor(values, dtype=torch.float32)
-
-
-def far_path(num_worlds: int) -> Tensor:
-    """A paddle out of the way."""
-    path = torch.zeros(num_worlds, 2, 12)
-    path[:, :, 2], path[:, :, 5] = 50.0, 1.0
-    return path
-
-
-def hits(count: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Balls that leave a paddle towards the opponent: over the net, into it, wide and long."""
-    generator = torch.Generator().manual_seed(2)
-    draw = torch.rand(count, 9, generator=generator)
-    position = rows([-1.9, -0.4, 0.85]) + draw[:, :3] * rows([0.4, 0.8, 0.4])
-    velocity = rows([3.0, -1.2, 0.0]) + draw[:, 3:6] * rows([5.0, 2.4, 3.5])
-    return position, velocity, (draw[:, 6:] - 0.5) * 200.0
 
 
 def test_1000_serves_agree_with_the_ode_solution():
@@ -115,32 +100,12 @@ def test_a_serve_into_the_net_does_not_reach_the_robot():
     assert bool(forecast.intercept_time.isnan())
 
 
-def play(position: Tensor, velocity: Tensor, spin: Tensor, params: BallParams, steps: int) -> dict[str, Tensor]:
-    """What ``fly`` makes of the same flights: time and place of the first bounce and floor contact."""
-    count = len(position)
-    sim = BallSim(count, "cpu", params, TABLE, DT, 1, 0.02)
-    for own, given in ((sim.position, position), (sim.velocity, velocity), (sim.spin, spin)):
-        own.copy_(given)
-    nan = torch.full((count,), torch.nan)
-    seen = {"own": nan.clone(), "table": nan.clone(), "floor": nan.clone(), "place": torch.zeros(count, 3)}
-    path, events = far_path(count), sim.events
-    for step in range(steps):
-        sim.fly(path)
-        table_time = torch.minimum(events.own_bounce_time, events.opponent_bounce_time)
-        new = table_time.isfinite() & seen["table"].isnan()
-        seen["place"] = torch.where(new.unsqueeze(1), events.bounce_position, seen["place"])
-        for name, time in (("own", events.own_bounce_time), ("table", table_time), ("floor", events.floor_time)):
-            first = time.isfinite() & seen[name].isnan()
-            seen[name] = torch.where(first, step * DT + time, seen[name])
-    return seen
-
-
 @pytest.mark.parametrize("preset", ["paper", "standard", "venue", "rubber"])
 def test_forecast_is_the_simulated_flight(preset: str):
-    position, velocity, spin = hits(300)
+    position, velocity, spin = random_returns(300)
     params = BallParams.preset(preset)
     forecast = forecast_flight(position, velocity, spin, params=params)
-    seen = play(position, velocity, spin, params, 100)
+    seen = first_contacts(position, velocity, spin, params)
     on_table = forecast.landing_own | forecast.landing_opponent
     assert 50 < int(on_table.sum()) < 290  # both kinds take part
     first_floor = ~(seen["table"] < seen["floor"].nan_to_num(torch.inf))
@@ -157,7 +122,7 @@ def test_the_forecast_moves_on_with_the_flight():
     sim.position.copy_(rows([1.35, 0.05, 1.03]))
     sim.velocity.copy_(rows([-5.8, -0.1, 1.7]))
     first = forecast_flight(sim.position, sim.velocity)
-    path = far_path(1)
+    path = far_path(1, 1)
     for step in range(1, 22):
         sim.fly(path)
         later = forecast_flight(sim.position, sim.velocity)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 import warp as wp
-from scipy.optimize import least_squares
 
 import pace.sim  # noqa: F401  sets Warp up before the kernel below is defined
 from pace.sim.aero import GRAVITY, air_factors, fly
-from pace.sim.ball import BallParams, BallSim, ball_preset
+from pace.sim.ball import BallParams
+from pace.sim.trials import fitted_drag, recorded_flights, true_drag
 
 MASS, RADIUS, DENSITY = 0.0027, 0.02, 1.225
 PAPER_DRAG = 0.0991  # 1/m, facts of the paper's simulation
@@ -94,66 +93,7 @@ def test_runge_kutta_is_of_fourth_order():
     assert 10.0 < coarse / fine < 40.0
 
 
-def recorded_flights(count: int, frames: int, noise: float) -> np.ndarray:
-    """Ball positions (frames, count, 3) m of flights before the bounce, 50 a second, as a motion capture sees them."""
-    rng = np.random.default_rng(4)
-    preset = ball_preset("paper")
-    sim = BallSim(count, "cpu", BallParams.from_config(preset), preset.table, 0.02, 1, 0.02)
-    path = torch.zeros(count, 2, 12)
-    path[:, :, 2], path[:, :, 5] = 9.0, 1.0
-    sim.position.copy_(torch.tensor([1.35, 0.0, 1.03]).expand(count, 3))
-    sim.velocity.copy_(torch.tensor(rng.uniform([-6.5, -0.8, 1.5], [-5.0, 0.4, 2.0], (count, 3))))
-    frames_seen = [sim.position.numpy().copy()]
-    for _ in range(frames - 1):
-        sim.fly(path)
-        frames_seen.append(sim.position.numpy().copy())
-    return np.stack(frames_seen) + rng.normal(0.0, noise, (frames, count, 3))
-
-
-def model_flights(k: float, start: np.ndarray, frames: int) -> np.ndarray:
-    """Positions (frames, ...) of flights from ``start`` (2, ..., 3): position and velocity, by fine midpoint steps."""
-    position, velocity = start.copy()
-    gravity = np.array([0.0, 0.0, -GRAVITY])
-    seen = [position.copy()]
-    for _ in range(frames - 1):
-        for _ in range(4):
-            a = gravity - k * np.linalg.norm(velocity, axis=-1, keepdims=True) * velocity
-            middle = velocity + 0.0025 * a
-            a = gravity - k * np.linalg.norm(middle, axis=-1, keepdims=True) * middle
-            position, velocity = position + 0.005 * middle, velocity + 0.005 * a
-        seen.append(position.copy())
-    return np.stack(seen)
-
-
-def fitted_drag(flights: np.ndarray) -> float:
-    """k (1/m) of all flights, with start and velocity of each free: least squares on the positions."""
-    frames, count, _ = flights.shape
-    launch = np.stack([flights[0], (flights[1] - flights[0]) / 0.02])
-
-    def residual(parameters: np.ndarray) -> np.ndarray:
-        start = parameters[1:].reshape(2, count, 3)
-        return (model_flights(parameters[0], start, frames) - flights).ravel()
-
-    def jacobian(parameters: np.ndarray) -> np.ndarray:
-        """Flights are independent, so one perturbed run serves the same parameter of all of them."""
-        base = residual(parameters)
-        out = np.zeros((base.size, parameters.size))
-        out[:, 0] = (residual(parameters + 1e-5 * np.eye(1, parameters.size)[0]) - base) / 1e-5
-        rows = np.arange(base.size).reshape(frames, count, 3)
-        for part in range(2):
-            for axis in range(3):
-                step = np.zeros((2, count, 3))
-                step[part, :, axis] = 1e-5
-                change = residual(parameters + np.concatenate([[0.0], step.ravel()])) - base
-                for flight in range(count):
-                    column = 1 + (part * count + flight) * 3 + axis
-                    out[rows[:, flight].ravel(), column] = change[rows[:, flight].ravel()] / 1e-5
-        return out
-
-    start = np.concatenate([[0.05], launch.ravel()])
-    return float(least_squares(residual, start, jac=jacobian, method="lm").x[0])  # type: ignore[arg-type]
-
-
 @pytest.mark.parametrize(("noise", "tolerance"), [(0.0, 5e-4), (0.001, 0.02)])
 def test_drag_is_found_back_from_22_flights(noise: float, tolerance: float):
-    assert fitted_drag(recorded_flights(22, 20, noise)) == pytest.approx(PAPER_DRAG, rel=tolerance)
+    assert true_drag("paper") == pytest.approx(PAPER_DRAG, rel=2e-3)
+    assert fitted_drag(recorded_flights(22, 20, noise)) == pytest.approx(true_drag("paper"), rel=tolerance)

@@ -13,63 +13,23 @@ from pace.config import ConfigError, load_train_config
 from pace.sim import reference
 from pace.sim.aero import GRAVITY
 from pace.sim.ball import DEFAULT_PRESET, BallEvents, BallParams, BallSim, ball_preset
+from pace.sim.trials import (
+    CONTROL_DT,
+    NO_AIR,
+    PRESETS,
+    REACH,
+    TABLE,
+    Swing,
+    far_path,
+    frame_difference,
+    make_sim,
+    phase_spread,
+    put,
+    random_strikes,
+)
 
-DT, SUBSTEPS = 0.02, 2
-TABLE = ball_preset("paper").table
+DT = CONTROL_DT
 TOP = TABLE.height
-REACH = TABLE.paddle_half_thickness + 0.02  # from the paddle's plane to a touching ball's centre
-PRESETS = ("paper", "standard", "venue", "rubber")
-NO_AIR = BallParams(0.0027, 0.02, 0.0, 0.0, 0.0, 0.9, 0.0, 0.25, 0.8, 0.0, 0.3)
-
-
-def make_sim(num_worlds: int, params: BallParams = NO_AIR, substeps: int = SUBSTEPS, ball_dt: float = 0.02) -> BallSim:
-    """Worlds on the CPU with the table of the presets."""
-    return BallSim(num_worlds, "cpu", params, TABLE, DT, substeps, ball_dt)
-
-
-def put(sim: BallSim, position: object, velocity: object, spin: object = (0.0, 0.0, 0.0)) -> None:
-    """Set the balls; rows broadcast over the worlds."""
-    for target, value in ((sim.position, position), (sim.velocity, velocity), (sim.spin, spin)):
-        target.copy_(torch.as_tensor(np.asarray(value), dtype=torch.float32).expand_as(target))
-
-
-class Swing:
-    """A paddle on a parabola that turns at a constant rate; arrays (N, 3), time 0 is arbitrary."""
-
-    def __init__(self, centre: object, normal: object, velocity: object = 0.0, turn: object = 0.0, pull: object = 0.0):
-        vectors = np.broadcast_arrays(*(np.atleast_2d(np.asarray(v, float)) for v in (centre, normal, velocity)))
-        self.centre, self.normal, self.velocity = (v + np.zeros((1, 3)) for v in vectors)
-        self.turn = np.asarray(turn, float) + np.zeros_like(self.centre)
-        self.pull = np.asarray(pull, float) + np.zeros_like(self.centre)
-
-    def at(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Centre, normal and velocity of the centre at ``time`` (N,) s."""
-        t = time[:, None]
-        centre = self.centre + t * self.velocity + 0.5 * t * t * self.pull
-        rate = np.linalg.norm(self.turn, axis=1, keepdims=True)
-        axis = self.turn / np.maximum(rate, 1e-12)
-        along = np.sum(axis * self.normal, axis=1, keepdims=True) * axis
-        side = np.cross(axis, self.normal)
-        normal = along + np.cos(rate * t) * (self.normal - along) + np.sin(rate * t) * side
-        return centre, normal, self.velocity + t * self.pull
-
-    def surface_velocity(self, point: np.ndarray, time: np.ndarray) -> np.ndarray:
-        """Velocity of the blade's point at ``point`` (N, 3)."""
-        centre, _, velocity = self.at(time)
-        return velocity + np.cross(self.turn, point - centre)
-
-    def path(self, start: np.ndarray, substeps: int = SUBSTEPS) -> Tensor:
-        """The path (N, S + 1, 12) of the control step that begins at ``start`` (N,) s."""
-        knots = []
-        for knot in range(substeps + 1):
-            centre, normal, velocity = self.at(start + knot * DT / substeps)
-            knots.append(np.concatenate([centre, normal, velocity, np.broadcast_to(self.turn, centre.shape)], axis=1))
-        return torch.tensor(np.stack(knots, axis=1), dtype=torch.float32).contiguous()
-
-
-def far_path(num_worlds: int, substeps: int = SUBSTEPS) -> Tensor:
-    """A paddle out of every ball's way."""
-    return Swing(np.full((num_worlds, 3), [0.0, 0.0, 50.0]), [0, 0, 1]).path(np.zeros(num_worlds), substeps)
 
 
 def fly_steps(sim: BallSim, steps: int) -> None:
@@ -178,31 +138,6 @@ def test_events_of_one_step_are_in_order_and_gone_in_the_next():
         assert torch.equal(value, empty), f.name
 
 
-def random_strikes(count: int, seed: int = 5) -> tuple[BallSim, Swing, np.ndarray, np.ndarray]:
-    """Balls that fly at points of the blades of swinging, turning paddles; with the velocity of the paddle's point."""
-    rng = np.random.default_rng(seed)
-    normal = rng.normal(size=(count, 3))
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    across = np.cross(normal, rng.normal(size=(count, 3)))
-    across *= 0.07 * rng.random((count, 1)) / np.linalg.norm(across, axis=1, keepdims=True)
-    centre = np.array([0.0, 0.0, 3.0]) + rng.uniform(-0.3, 0.3, (count, 3))
-    swing = Swing(
-        centre, normal, rng.uniform(-4, 4, (count, 3)), rng.uniform(-8, 8, (count, 3)), rng.uniform(-40, 40, (count, 3))
-    )
-    moment = rng.uniform(0.002, 0.018, count)
-    at_centre, at_normal, _ = swing.at(moment)
-    contact = at_centre + across - np.sum(across * at_normal, axis=1, keepdims=True) * at_normal + REACH * at_normal
-    own = swing.surface_velocity(contact, moment)
-    slant = rng.uniform(-3, 3, (count, 3))
-    velocity = own + slant - np.sum(slant * at_normal, axis=1, keepdims=True) * at_normal
-    velocity = velocity - rng.uniform(2, 12, (count, 1)) * at_normal
-    t = moment[:, None]
-    sim = make_sim(count)
-    gravity = np.array([0.0, 0.0, -GRAVITY])
-    put(sim, contact - velocity * t + 0.5 * gravity * t**2, velocity - gravity * t, rng.uniform(-150, 150, (count, 3)))
-    return sim, swing, moment, contact
-
-
 def test_strikes_by_a_swinging_turning_paddle_agree_with_the_balance_of_momentum():
     sim, swing, moment, contact = random_strikes(300)
     spin = sim.spin.clone().numpy().astype(float)
@@ -228,60 +163,20 @@ def test_strikes_by_a_swinging_turning_paddle_agree_with_the_balance_of_momentum
     assert not events["hit_rim"].any()
 
 
-def struck(frame_velocity: np.ndarray, yaw: float) -> tuple[np.ndarray, np.ndarray]:
-    """Velocity (turned back, seen from the moving frame) and spin after the same strikes in another frame."""
-    sim, swing, _, _ = random_strikes(200)
-    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
-    swing = Swing(
-        swing.centre @ turn.T,
-        swing.normal @ turn.T,
-        swing.velocity @ turn.T + frame_velocity,
-        swing.turn @ turn.T,
-        swing.pull @ turn.T,
-    )
-    position, velocity, spin = (a.numpy() @ turn.T for a in (sim.position, sim.velocity, sim.spin))
-    put(sim, position, velocity + frame_velocity, spin)
-    sim.fly(swing.path(np.zeros(200)))
-    assert bool((sim.events.paddle_hit >= 1).all())
-    return (sim.events.hit_velocity_out.numpy() - frame_velocity) @ turn, sim.events.hit_spin_out.numpy() @ turn
-
-
 @pytest.mark.parametrize(
     ("velocity", "yaw"), [((5.0, -3.0, 4.0), 0.0), ((0.0, 0.0, 0.0), 1.1), ((-9.0, 6.0, 0.0), -2.0)]
 )
 def test_strikes_do_not_depend_on_the_frame(velocity: tuple[float, float, float], yaw: float):
-    home, home_spin = struck(np.zeros(3), 0.0)
-    moved, moved_spin = struck(np.array(velocity), yaw)
-    speed = np.linalg.norm(home, axis=1, keepdims=True)
-    assert np.max(np.abs(moved - home) / speed) < 1e-3
-    assert np.max(np.abs(moved_spin - home_spin)) < 0.5
+    share, spin = frame_difference(velocity, yaw)
+    assert share < 1e-3
+    assert spin < 0.5
 
 
 @pytest.mark.parametrize("substeps", [2, 4, 10])
 def test_strikes_do_not_depend_on_where_in_a_step_they_fall(substeps: int):
-    phases = 200
-    ball = reference.ReferenceBall(*(np.full(phases, v) for v in (0.0027, 0.02, 1.225, 0.47, 0.5, 0.9, 0.0, 0.25)))
-    params = BallParams(0.0027, 0.02, 1.225, 0.47, 0.5, 0.9, 0.0, 0.25, 0.8, 0.01, 0.3)
-    sim = make_sim(phases, params, substeps)
-    # At time 0 the ball is 2 cm from the blade's plane; the control steps begin at other times before that.
-    swing = Swing(
-        np.full((phases, 3), [-1.6, 0.0, 1.1]), [0.96, 0.0, 0.28], [2.5, 0.5, 0.8], [0, 6.0, -4.0], [40.0, 0, 20.0]
-    )
-    meeting = np.array([-1.6, 0.03, 1.12]) + (REACH + 0.02) * swing.normal
-    velocity, spin = np.tile([-4.0, 0.3, -1.0], (phases, 1)), np.tile([20.0, -80.0, 30.0], (phases, 1))
-    start = -np.linspace(0.0, DT, phases, endpoint=False)
-    position, velocity = reference.fly_for(ball, meeting, velocity, spin, start)
-    put(sim, position, velocity, spin)
-    out, out_spin, hit = np.zeros((phases, 3)), np.zeros((phases, 3)), np.zeros(phases, bool)
-    for step in range(2):
-        sim.fly(swing.path(start + step * DT, substeps))
-        new = sim.events.paddle_hit.numpy() > 0
-        out[new], out_spin[new] = sim.events.hit_velocity_out.numpy()[new], sim.events.hit_spin_out.numpy()[new]
-        hit |= new
-    assert hit.all()
-    speed = np.linalg.norm(out, axis=1).mean()
-    assert np.ptp(out, axis=0).max() < 1e-3 * speed
-    assert np.ptp(out_spin, axis=0).max() < 1e-3 * np.linalg.norm(out_spin, axis=1).mean() + 0.05
+    share, spin = phase_spread(substeps)
+    assert share < 1e-3
+    assert spin < 2e-3
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])

@@ -103,6 +103,25 @@ def test_the_ball_pushes_the_paddle_back() -> None:
     assert speeds[0] < speeds[1] - 0.02
 
 
+def test_the_reaction_acts_where_the_ball_touched() -> None:
+    """World 0: a hit, at the same place of the blade; world 1: a resting ball, where it lay at the step's end."""
+    worlds = make_worlds(2)
+    stand(worlds)
+    events, paddle = worlds.ball.events, worlds.robot.paddle_position
+    events.paddle_impulse.copy_(torch.tensor([0.01, -0.004, 0.006]).expand(2, 3))
+    events.paddle_hit[0] = 1
+    events.hit_offset[0] = torch.tensor([0.03, 0.0, 0.06])
+    events.hit_position[0] = torch.tensor([9.0, 0.0, 0.0])  # the paddle has moved on since
+    events.hit_point[0] = torch.tensor([8.98, 0.0, 0.0])
+    events.impulse_point[1] = paddle[1] + torch.tensor([0.0, 0.02, 0.05])
+    worlds._react()
+    force = events.paddle_impulse / worlds.control_dt
+    points = torch.stack([paddle[0] + torch.tensor([0.01, 0.0, 0.06]), events.impulse_point[1]])
+    torch.testing.assert_close(worlds._applied[:, :3], force)
+    torque = torch.linalg.cross(points - worlds.robot.base_position, force)  # the base stands upright
+    torch.testing.assert_close(worlds._applied[:, 3:6], torque)
+
+
 def test_state_dict_restores_the_next_step_exactly() -> None:
     config = load_train_config(["engine=native"])
     worlds = Worlds(config, 8, "cpu", torch.Generator().manual_seed(1))

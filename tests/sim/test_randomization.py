@@ -1,0 +1,157 @@
+"""Randomisation: its ranges cover the ball presets, and each draw reaches its own world, on both engines."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from pace.config import BallConfig, TrainConfig, load_train_config
+from pace.sim.ball import ball_preset
+from pace.sim.randomization import BALL_DRAWS, BALL_LIMITS
+from pace.sim.trials import PRESETS
+from pace.sim.worlds import Worlds
+
+WORLDS = 3
+EVERY = torch.ones(WORLDS, dtype=torch.bool)
+TABLE_SPEEDS = np.linspace(2.0, 3.4, 16)  # m/s along the normal: bounces of serves
+PADDLE_SPEEDS = np.linspace(3.0, 12.0, 16)  # strikes
+
+
+@lru_cache
+def wide_config() -> TrainConfig:
+    return load_train_config(["randomization=wide"])
+
+
+def drawn_range(name: str) -> tuple[float, float]:
+    """Lowest and highest value of a ball parameter under ``randomization=wide``."""
+    config = wide_config()
+    range_name, scales = BALL_DRAWS[name]
+    nominal, (low, high) = getattr(config.ball, name), getattr(config.randomization, range_name)
+    ends = np.array([low, high]) * nominal if scales else np.array([low, high]) + nominal
+    low, high = ends.clip(*BALL_LIMITS.get(name, (0.0, np.inf)))
+    return float(low), float(high)
+
+
+def assert_covered(name: str, value: np.ndarray | float, slope_effect: np.ndarray | float = 0.0) -> None:
+    low, high = drawn_range(name)
+    assert np.all(low + slope_effect <= value), name
+    assert np.all(value <= high + slope_effect), name
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_wide_covers_every_preset(preset: str) -> None:
+    ball: BallConfig = ball_preset(preset)
+    rubber = wide_config().ball
+    assert rubber.name == "rubber"
+    thickness = ball.air_density / rubber.air_density  # the draws have rubber's air
+    assert_covered("mass", ball.mass)
+    assert_covered("drag_coefficient", thickness * ball.drag_coefficient)
+    assert_covered("magnus_coefficient", thickness * ball.magnus_coefficient)
+    for surface, speeds in (("table", TABLE_SPEEDS), ("paddle", PADDLE_SPEEDS)):
+        assert_covered(f"{surface}_friction", getattr(ball, f"{surface}_friction"))
+        restitution, slope = (getattr(ball, f"{surface}_restitution{end}") for end in ("", "_slope"))
+        own_slope = getattr(rubber, f"{surface}_restitution_slope")
+        assert_covered(f"{surface}_restitution", restitution - slope * speeds, -own_slope * speeds)
+
+
+def test_wide_keeps_friction_positive() -> None:
+    assert drawn_range("table_friction")[0] > 0.1
+    assert drawn_range("paddle_friction")[0] > 0.1
+
+
+@pytest.fixture(scope="module", params=["native", "mjwarp"])
+def worlds(request: pytest.FixtureRequest) -> Worlds:
+    """Clean worlds on each engine; ``play`` puts back what a test changes."""
+    options = [f"engine={request.param}", "randomization=none", "engine.threads=1"]
+    return Worlds(load_train_config(options), WORLDS, "cpu")
+
+
+def standing(worlds: Worlds) -> Tensor:
+    qpos = torch.as_tensor(worlds.model.key_qpos[0], dtype=torch.float32).repeat(WORLDS, 1)
+    qpos[:, 0] = -2.0
+    return qpos
+
+
+def serve(worlds: Worlds, position: Tensor, velocity: Tensor) -> None:
+    spin = torch.tensor([50.0, -100.0, 20.0])
+    worlds.serve(EVERY, *(value.expand(WORLDS, 3) for value in (position, velocity, spin)))
+
+
+def play(worlds: Worlds, change: Callable[[], None]) -> tuple[Tensor, Tensor]:
+    """Ball (N, 18) after a bounce and after a strike, and the robot's velocities (N, 27) at the end.
+
+    Every world stands, is changed by ``change``, and gets the same targets and balls.
+    """
+    worlds.reset_robot(EVERY, standing(worlds), torch.zeros(WORLDS, 27))
+    change()
+    targets = worlds.nominal.repeat(WORLDS, 1)
+    targets[:, 4:8] += torch.tensor([-0.3, 0.2, 0.4, -0.2])  # the arm with the paddle
+    serve(worlds, torch.tensor([-0.6, 0.0, 0.815]), torch.tensor([-6.0, 0.5, -2.0]))
+    worlds.step(targets)
+    worlds.step(targets)
+    assert (worlds.ball.position[:, 2] > 0.79).all()  # it has bounced
+    seen = [worlds.ball.position.clone(), worlds.ball.velocity.clone(), worlds.ball.spin.clone()]
+    normal = worlds.robot.paddle_normal[0].clone()
+    across = torch.linalg.cross(normal, torch.tensor([0.0, 0.0, 1.0]))
+    # so slanting that friction slides: it then counts; 14 ms to the blade's middle
+    serve(worlds, worlds.robot.paddle_position[0] + 0.1 * normal - 0.13 * across, 9.0 * across - 5.0 * normal)
+    worlds.step(targets)
+    assert (worlds.ball.events.paddle_hit == 1).all()
+    worlds.step(targets)
+    seen += [worlds.ball.position, worlds.ball.velocity, worlds.ball.spin]
+    return torch.cat(seen, 1), worlds.engine.qvel_path[:, -1].clone()
+
+
+def assert_only_world_1_changed(before: Tensor, after: Tensor, least: float) -> None:
+    others = [0, 2]
+    torch.testing.assert_close(after[others], before[others], rtol=0, atol=0)
+    assert (after[1] - before[1]).abs().max() > least
+
+
+@pytest.mark.parametrize("name", BALL_DRAWS)
+def test_a_ball_parameter_changes_its_world_alone(worlds: Worlds, name: str) -> None:
+    def change() -> None:
+        value = getattr(worlds.ball.params, name)
+        value[1] = 0.8 * value[1] if value[1] > 0 else 0.5
+
+    ball, robot = play(worlds, lambda: None)
+    changed_ball, changed_robot = play(worlds, change)
+    assert_only_world_1_changed(ball, changed_ball, 1e-3)
+    # what the paddle feels of it: another mass, speed or impulse of the ball; air and table act on it before
+    least = 1e-4 if name.startswith(("mass", "paddle")) else -1.0
+    assert_only_world_1_changed(robot, changed_robot, least)
+
+
+def test_the_actuator_delay_changes_its_world_alone(worlds: Worlds) -> None:
+    def change() -> None:
+        worlds.randomizer.actuator_delay[1] = 0.006
+        worlds._update_delay()
+
+    _, robot = play(worlds, lambda: None)
+    _, changed = play(worlds, change)
+    assert_only_world_1_changed(robot, changed, 0.1)
+
+
+@pytest.mark.parametrize("engine", ["native", "mjwarp"])
+def test_a_reset_draws_anew_for_its_world_alone(engine: str) -> None:
+    config = load_train_config([f"engine={engine}", "randomization=full", "engine.threads=1"])
+    config.randomization.push_interval = [0.0, 0.0]
+    worlds = Worlds(config, WORLDS, "cpu")
+    worlds.reset_robot(EVERY, standing(worlds), torch.zeros(WORLDS, 27))
+    start = {name: value.clone() for name, value in worlds.state_dict().items()}
+    seen = []
+    for mask in (torch.zeros(WORLDS, dtype=torch.bool), torch.tensor([False, True, False])):
+        worlds.load_state_dict(start)
+        worlds.reset_robot(mask, standing(worlds), torch.zeros(WORLDS, 27))
+        serve(worlds, torch.tensor([-0.6, 0.0, 0.815]), torch.tensor([-6.0, 0.5, -2.0]))
+        for _ in range(3):
+            worlds.step(worlds.nominal.repeat(WORLDS, 1) + 0.2)
+        seen.append((worlds.engine.qvel_path[:, -1].clone(), worlds.ball.velocity.clone()))
+    (robot, ball), (new_robot, new_ball) = seen
+    assert_only_world_1_changed(robot, new_robot, 1e-2)
+    assert_only_world_1_changed(ball, new_ball, 1e-3)
