@@ -310,11 +310,12 @@ class RewardManager:
 
     def compute(self, state: TaskState) -> None:
         """Evaluate all terms on ``state``. Errors: ``ValueError`` that names a term whose shape is not (N,)."""
-        for row, entry in zip(self.values, self._entries, strict=True):
-            value = entry.function(state, entry.params)
-            if value.shape != row.shape:
-                raise ValueError(f"reward term '{entry.name}' has shape {tuple(value.shape)}, not {tuple(row.shape)}")
-            row.copy_(value)
+        values = [entry.function(state, entry.params) for entry in self._entries]
+        for entry, value in zip(self._entries, values, strict=True):
+            if value.shape != self.reward.shape:
+                wanted = tuple(self.reward.shape)
+                raise ValueError(f"reward term '{entry.name}' has shape {tuple(value.shape)}, not {wanted}")
+        torch.stack(values, out=self.values)
         torch.mv(self.values.T, self._weights, out=self.reward)
         self.sums.addcmul_(self.values.sum(1), self._weights)
 
