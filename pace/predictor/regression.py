@@ -11,8 +11,8 @@ from torch import Tensor
 from pace.config import PredictorConfig
 from pace.predictor.network import PredictorNetwork
 
-TIME_BINS = (0.1, 0.2, 0.3, 0.4)  # s before the apex; the last bin is open
-BIN_NAMES = ("0_0.1s", "0.1_0.2s", "0.2_0.3s", "0.3_0.4s", "over_0.4s")
+TIME_BINS = (0.0, 0.1, 0.2, 0.3, 0.4)  # s before the apex; the first and the last bin are open
+BIN_NAMES = ("after_apex", "0_0.1s", "0.1_0.2s", "0.2_0.3s", "0.3_0.4s", "over_0.4s")
 
 
 class PredictorSource(Protocol):

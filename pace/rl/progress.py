@@ -6,6 +6,7 @@ import math
 import sys
 import time
 from collections import deque
+from collections.abc import Sequence
 
 from tqdm import tqdm
 
@@ -27,18 +28,28 @@ def clock(seconds: float) -> str:
 
 
 def rate_texts(rates: dict[str, float]) -> list[str]:
-    """The four rates in words; a dash where nothing was counted yet."""
+    """Rates (keys of :data:`RATES`) in words; a dash where nothing was counted yet."""
     texts = []
-    for name, (label, factor, digits, unit) in RATES.items():
-        value = factor * rates[name]
+    for name, rate in rates.items():
+        label, factor, digits, unit = RATES[name]
+        value = factor * rate
         texts.append(f"{label} -" if math.isnan(value) else f"{label} {value:.{digits}f}{unit}")
     return texts
 
 
 class Progress:
-    """Progress towards the end of a run. ``samples`` is the limit in control steps, ``seconds`` that of the clock."""
+    """Progress towards the end of a run. ``samples`` is the limit in control steps, ``seconds`` that of the clock,
+    ``shown`` the columns to show."""
 
-    def __init__(self, enabled: bool, samples: float, seconds: float, first_samples: float = 0.0) -> None:
+    def __init__(
+        self,
+        enabled: bool,
+        samples: float,
+        seconds: float,
+        first_samples: float = 0.0,
+        shown: Sequence[str] = tuple(RATES),
+    ) -> None:
+        self.shown = tuple(shown)
         self.samples, self.seconds, self.first_samples = samples, seconds, first_samples
         self.recent: deque[dict[str, float]] = deque(maxlen=WINDOW)
         self.started = time.monotonic()
@@ -83,8 +94,8 @@ class Progress:
         return " | ".join(parts)
 
     def rates(self) -> dict[str, float]:
-        """Hit, return and fall rate and the predictor's error over the last updates."""
-        return {name: self.mean(name) for name in RATES}
+        """The shown rates over the last updates."""
+        return {name: self.mean(name) for name in self.shown}
 
     def mean(self, name: str) -> float:
         """Mean of a column over the last updates, NaN left out; NaN if nothing is there."""

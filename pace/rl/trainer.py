@@ -206,14 +206,15 @@ class Trainer:
         )
 
     def load_weights(self, checkpoint: Checkpoint) -> None:
-        """Start from another run's policy, critic, normalisers and predictor.
+        """Start from another run's policy, critic, normalisers and predictor, or from a predictor's weights alone.
 
         Errors: :class:`CheckpointError` for a missing or reshaped tensor.
         """
-        for part, module in (("agent", self.agent), ("predictor", self.predictor)):
-            if part not in checkpoint.weights:
-                raise CheckpointError(f"{checkpoint.path}: the weights of the {part} are missing")
-            load_weights(module, checkpoint.weights[part], f"{checkpoint.path} ({part})")
+        if "predictor" not in checkpoint.weights:
+            raise CheckpointError(f"{checkpoint.path}: the weights of the predictor are missing")
+        for part, module in (("predictor", self.predictor), ("agent", self.agent)):
+            if part in checkpoint.weights:
+                load_weights(module, checkpoint.weights[part], f"{checkpoint.path} ({part})")
         self.agent.actor.bound_std(self.config.algo.std_floor, self.config.algo.std[0].value)
 
     def resume(self, checkpoint: Checkpoint) -> None:

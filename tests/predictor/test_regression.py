@@ -58,7 +58,7 @@ def test_rmse_is_of_valid_samples_before_the_fit_and_by_time() -> None:
     metrics = trainer.update()
     assert metrics["predictor_rmse_cm"] == pytest.approx(100 * error[valid].mean().sqrt().item(), rel=1e-4)
     second = valid & (time >= 0.1) & (time < 0.2)
-    assert metrics[f"predictor_rmse_cm/{BIN_NAMES[1]}"] == pytest.approx(
+    assert metrics[f"predictor_rmse_cm/{BIN_NAMES[2]}"] == pytest.approx(
         100 * error[second].mean().sqrt().item(), rel=1e-4
     )
 
