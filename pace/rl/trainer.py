@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from pace.config import ConfigError, TrainConfig, to_dict
 from pace.predictor.network import PredictorNetwork
@@ -30,10 +30,11 @@ from pace.rl.checkpoint import (
 from pace.rl.policy import Agent
 from pace.rl.ppo import PPO
 from pace.rl.progress import Progress
-from pace.rl.rollout import Rollout, VectorTask
+from pace.rl.rollout import Rollout, RolloutError, VectorTask
 from pace.rl.run_folder import RunFolder, plot_learning_curve
 
 CHECKPOINTS_KEPT = 4
+LAST_GOOD = "last_good"  # folder in the run: the weights before an update that failed
 COUNTS = ("serves", "hits", "successes", "falls", "episodes", "steps", "reward_sum")
 
 
@@ -120,7 +121,8 @@ class Trainer:
     def train(self) -> Summary:
         """Run until ``samples``, ``minutes`` or a signal; writes checkpoints, metrics and the learning curve.
 
-        Errors: :class:`RolloutError` for values that are not finite; the last good checkpoint then stays the newest.
+        Errors: :class:`RolloutError` for values that are not finite; the weights before that update are then saved in
+        ``last_good/`` (for ``init_from``), and the last checkpoint stays the newest (for ``resume``).
         """
         config = self.config
         if self.samples >= config.samples:
@@ -131,7 +133,7 @@ class Trainer:
         try:
             with self._stop.listening():
                 while reason is None:
-                    row = self.update()
+                    row = self._safe_update()
                     now = time.monotonic()
                     self.wall_s = wall_before + now - started
                     row |= {"wall_s": self.wall_s, "samples_per_s": self._samples_per_update / (now - last)}
@@ -146,6 +148,22 @@ class Trainer:
             curve = plot_learning_curve(self.run.path)
         newest = list_checkpoints(self.run.path)[-1]
         return Summary(reason, self.updates, self.samples, self.wall_s, newest, curve, progress.rates())
+
+    def _safe_update(self) -> dict[str, float]:
+        """:meth:`update`; when it fails, the weights before it are saved beside the checkpoints."""
+        good = {part: {k: v.clone() for k, v in module.state_dict().items()} for part, module in self._networks()}
+        try:
+            return self.update()
+        except RolloutError as error:
+            checkpoint = Checkpoint(to_dict(self.config), self._counters(), good, None)
+            folder = save_checkpoint(self.run.path / LAST_GOOD, checkpoint)
+            raise RolloutError(f"{error}; the weights before this update are in {folder}") from error
+
+    def _networks(self) -> tuple[tuple[str, nn.Module], ...]:
+        return (("agent", self.agent), ("predictor", self.predictor))
+
+    def _counters(self) -> dict[str, float]:
+        return {"updates": self.updates, "samples": self.samples, "wall_s": self.wall_s}
 
     @property
     def _samples_per_update(self) -> int:
@@ -195,8 +213,8 @@ class Trainer:
             random_state["cuda"] = torch.cuda.get_rng_state(self.device)
         return Checkpoint(
             config=to_dict(self.config),
-            counters={"updates": self.updates, "samples": self.samples, "wall_s": self.wall_s},
-            weights={"agent": self.agent.state_dict(), "predictor": self.predictor.state_dict()},
+            counters=self._counters(),
+            weights={part: module.state_dict() for part, module in self._networks()},
             training={
                 "ppo": self.ppo.state_dict(),
                 "regression": self.regression.state_dict(),
@@ -212,7 +230,7 @@ class Trainer:
         """
         if "predictor" not in checkpoint.weights:
             raise CheckpointError(f"{checkpoint.path}: the weights of the predictor are missing")
-        for part, module in (("predictor", self.predictor), ("agent", self.agent)):
+        for part, module in self._networks():
             if part in checkpoint.weights:
                 load_weights(module, checkpoint.weights[part], f"{checkpoint.path} ({part})")
         self.agent.actor.bound_std(self.config.algo.std_floor, self.config.algo.std[0].value)

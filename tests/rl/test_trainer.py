@@ -136,8 +136,11 @@ def test_a_nan_keeps_the_last_good_checkpoint(tmp_path: Path) -> None:
     trainer.env.poison_step = 30  # type: ignore[attr-defined]
     with pytest.raises(RolloutError, match="column 1 of world 3 "):
         trainer.train()
+    assert load_checkpoint(tmp_path / "last_good").counters["updates"] == 2
     saved = load_checkpoint(tmp_path)
     assert saved.counters["updates"] == 2
+    for name, tensor in load_checkpoint(tmp_path / "last_good").weights["agent"].items():
+        assert torch.equal(tensor, saved.weights["agent"][name])
     assert all(torch.isfinite(tensor).all() for tensor in saved.weights["agent"].values())
 
 
