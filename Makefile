@@ -18,8 +18,8 @@ test: venv  ## run the test suite: pytest $(ARGS)
 	$(BIN)/python -m pytest $(ARGS)
 
 lint: venv  ## ruff and pyright
-	$(BIN)/ruff check pace tests
-	$(BIN)/ruff format --check pace tests
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 
 bench: venv  ## measure speed and memory: python -m pace.bench $(ARGS)

@@ -73,7 +73,7 @@ class RobotConfig:
 
 @dataclass
 class TableConfig:
-    """Table, net, floor and paddle as the ball meets them (world frame: origin on the floor under the table's centre)."""
+    """Table, net, floor and paddle as the ball meets them; world frame, origin on the floor under the table's centre."""
 
     length: float  # m, along x
     width: float  # m, along y
@@ -471,6 +471,23 @@ class EvaluateConfig:
         for name in ("serves", "sweep_serves", "num_worlds"):
             _require(getattr(self, name) >= 1, f"{name} must be at least 1, got {getattr(self, name)}")
         _require(self.warmup_serves >= 0, f"warmup_serves must not be negative, got {self.warmup_serves}")
+
+
+@dataclass
+class ExportConfig:
+    """``python -m pace.rl.export``: which policy, where to, and how it is checked."""
+
+    run: str | None
+    out: str
+    check_worlds: int
+    check_steps: int
+    tolerance: float  # rad, m, s
+    seed: int
+
+    def __post_init__(self) -> None:
+        _require(self.run is not None, "which run? give its folder, a checkpoint or pretrained/<name>")
+        for name in ("check_worlds", "check_steps"):
+            _require(getattr(self, name) >= 1, f"{name} must be at least 1, got {getattr(self, name)}")
 
 
 def parse(config: DictConfig | dict[str, Any], schema: type[T]) -> T:
