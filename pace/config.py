@@ -73,7 +73,7 @@ class RobotConfig:
 
 @dataclass
 class TableConfig:
-    """Table, net, floor and paddle as the ball meets them; world frame, origin on the floor under the table's centre."""
+    """Table, net, floor and paddle as the ball meets them; world frame, origin under the table's centre."""
 
     length: float  # m, along x
     width: float  # m, along y
