@@ -24,6 +24,7 @@ from pace.sim.ball_kernels import (
 )
 from pace.sim.flight import Scene
 from pace.sim.rebound import Material
+from pace.sim.sharing import torch_stream
 
 __all__ = ["FORECAST_HORIZON", "BallEvents", "BallParams", "BallSim", "Forecast", "ball_preset"]
 
@@ -324,7 +325,7 @@ class BallSim:
     def _launch(self, launch: wp.Launch) -> None:
         """Replay a launch on torch's current stream, so that it keeps its place among torch's own kernels."""
         if self.device.type == "cuda":
-            launch.launch(stream=wp.stream_from_torch(torch.cuda.current_stream(self.device)))
+            launch.launch(stream=torch_stream(self.device))
         else:
             launch.launch()
 

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from pace.config import EngineConfig
 from pace.sim.engine import ModelFields, StateTensors
+from pace.sim.sharing import torch_stream
 
 #: Overflows that drop contacts or constraints. The solver's iteration limits, which share the bit mask, do not.
 _DROPPED = (
@@ -48,9 +49,10 @@ def _record_state(
 class MjwarpEngine(StateTensors):
     """MuJoCo Warp in float32. See :class:`~pace.sim.engine.RobotEngine`.
 
-    On a GPU one control step is one CUDA graph, captured at the first ``advance``. The graph holds the addresses of
-    the arrays and the options of that moment. Values are edited in place without a new capture; after replacing an
-    array of ``model`` or ``data``, or an option, set ``graph`` to None, and the next step captures anew.
+    On a GPU one control step is one CUDA graph, captured at the first ``advance`` and launched on torch's current
+    stream. The graph holds the addresses of the arrays and the options of that moment. Values are edited in place
+    without a new capture; after replacing an array of ``model`` or ``data``, or an option, set ``graph`` to None, and
+    the next step captures anew. The solver's loop ends on the device: a conditional node of the graph.
     """
 
     def __init__(
@@ -83,14 +85,17 @@ class MjwarpEngine(StateTensors):
         if self._warp_device.is_cuda:
             if self.graph is None:
                 self._capture()
-            wp.capture_launch(self.graph)
+            wp.capture_launch(self.graph, stream=torch_stream(self.device))
         else:
             self._play()
         self._read_sensors(self._sensordata, self._actuator_force)
 
     def _capture(self) -> None:
+        """Make the graph, once. On Warp's own stream, for torch's default stream cannot be captured."""
         saved = {name: value.clone() for name, value in self.state_dict().items()}
+        wp.synchronize_device(self._warp_device)
         self._play()  # compiles its kernels, which may fail inside a capture
+        wp.synchronize_device(self._warp_device)
         self.load_state_dict(saved)
         with wp.ScopedDevice(self._warp_device), wp.ScopedCapture() as capture:
             self._play()

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pace.sim.robot import FEET
+from pace.sim.sharing import record
 
 #: The tips, in the order of the chains: sites of the model.
 TIPS = ("paddle", *FEET, "head")
@@ -224,8 +225,8 @@ class Kinematics:
     """
 
     def __init__(self, model: mujoco.MjModel, num_worlds: int, substeps: int, device: torch.device | str) -> None:
-        self._device = wp.device_from_torch(torch.device(device))
-        self._chains = _build_chains(model, self._device)
+        self._device = torch.device(device)
+        self._chains = _build_chains(model, wp.device_from_torch(self._device))
         self._num_worlds = num_worlds
         self.paddle_path = torch.zeros(num_worlds, substeps + 1, 12, device=device)
         self.foot_position = torch.zeros(num_worlds, 2, 3, device=device)
@@ -238,6 +239,7 @@ class Kinematics:
         self._sensed_centre = torch.zeros(num_worlds, 3, device=device)
         self._sensed_normal = torch.zeros(num_worlds, 3, device=device)
         self._sensed_pose: tuple[Tensor | None, ...] = (None, None, None)
+        self._push: tuple[Tensor | None, ...] = (None, None, None)
 
     def update(self, qpos_path: Tensor, qvel_path: Tensor) -> None:
         """Fill the attributes from qpos (N, S + 1, 28) and qvel (N, S + 1, 27).
@@ -246,7 +248,7 @@ class Kinematics:
         """
         if self._path is None or self._path[0] is not qpos_path or self._path[1] is not qvel_path:
             self._bind(qpos_path, qvel_path)
-        self._command.launch()
+        self._update()
 
     def _bind(self, qpos_path: Tensor, qvel_path: Tensor) -> None:
         worlds, instants, _ = self.paddle_path.shape
@@ -255,13 +257,9 @@ class Kinematics:
                 raise ValueError(f"{name} must be {(worlds, instants, width)}, not {tuple(path.shape)}")
         self._path = (qpos_path, qvel_path)
         self._warp_path = [wp.from_torch(qpos_path), wp.from_torch(qvel_path)]
-        self._command = wp.launch(
-            _update,
-            dim=(worlds, instants + len(TIPS) - 1),
-            inputs=[self._chains, *self._warp_path, *self._outputs],
-            device=self._device,
-            record_cmd=True,
-        )
+        self._push = (None, None, None)  # its launch holds the old path
+        inputs = [self._chains, *self._warp_path, *self._outputs]
+        self._update = record(_update, (worlds, instants + len(TIPS) - 1), inputs, self._device)
 
     def paddle_pose(self, base_position: Tensor, base_quat: Tensor, joint_position: Tensor) -> tuple[Tensor, Tensor]:
         """Paddle centre (N, 3) m and unit normal (N, 3), world frame, of any pose, for instance a sensed one.
@@ -272,28 +270,30 @@ class Kinematics:
         pose = (base_position, base_quat, joint_position)
         if any(given is not bound for given, bound in zip(pose, self._sensed_pose, strict=True)):
             self._bind_pose(pose)
-        self._pose_command.launch()
+        self._compute_pose()
         return self._sensed_centre, self._sensed_normal
 
     def _bind_pose(self, pose: tuple[Tensor, Tensor, Tensor]) -> None:
         self._sensed_pose = pose
         self._warp_pose = [wp.from_torch(t) for t in (*pose, self._sensed_centre, self._sensed_normal)]
-        self._pose_command = wp.launch(
-            _paddle_pose,
-            dim=self._num_worlds,
-            inputs=[self._chains, *self._warp_pose],
-            device=self._device,
-            record_cmd=True,
-        )
+        self._compute_pose = record(_paddle_pose, self._num_worlds, [self._chains, *self._warp_pose], self._device)
 
     def paddle_generalized_force(self, force: Tensor, point: Tensor, out: Tensor) -> None:
         """Write J^T f of a force on the paddle's link into ``out`` (N, 27), for the end of the path last given.
 
-        Args: force (N, 3) N and its point of attack (N, 3) m, world frame.
+        Args: force (N, 3) N and its point of attack (N, 3) m, world frame. Give the same tensors each time: others are
+        bound anew, which takes longer.
         Errors: RuntimeError before the first :meth:`update`.
         """
+        push = (force, point, out)
+        if any(given is not bound for given, bound in zip(push, self._push, strict=True)):
+            self._bind_push(push)
+        self._compute_push()
+
+    def _bind_push(self, push: tuple[Tensor, Tensor, Tensor]) -> None:
         if self._path is None:
             raise RuntimeError("paddle_generalized_force needs the robot's state: call update() first")
-        arrays = [wp.from_torch(t) for t in (force, point, out)]
-        inputs = [self._chains, *self._warp_path, *arrays]
-        wp.launch(_paddle_jacobian_transpose, dim=self._num_worlds, inputs=inputs, device=self._device)
+        self._push = push
+        self._warp_push = [wp.from_torch(t) for t in push]
+        inputs = [self._chains, *self._warp_path, *self._warp_push]
+        self._compute_push = record(_paddle_jacobian_transpose, self._num_worlds, inputs, self._device)

@@ -24,9 +24,19 @@ def share_all(arrays: type, tensors: Mapping[str, Tensor]) -> Any:
     return struct
 
 
-def record(kernel: wp.Kernel, num_worlds: int, inputs: list[Any], device: torch.device) -> Callable[[], None]:
-    """A launch over N worlds that is only replayed when called, on torch's current stream."""
-    launch = wp.launch(kernel, dim=num_worlds, inputs=inputs, device=wp.device_from_torch(device), record_cmd=True)
+def torch_stream(device: torch.device) -> wp.Stream:
+    """Torch's current stream on a GPU. Warp's work given to it keeps its place among torch's own kernels.
+
+    Warp's default stream waits for torch's default one and the other way round, but for no other stream of torch.
+    """
+    return wp.stream_from_torch(torch.cuda.current_stream(device))
+
+
+def record(
+    kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list[Any], device: torch.device
+) -> Callable[[], None]:
+    """A launch, over N worlds for instance, that is only replayed when called, on torch's current stream."""
+    launch = wp.launch(kernel, dim=dim, inputs=inputs, device=wp.device_from_torch(device), record_cmd=True)
     if device.type == "cuda":
-        return lambda: launch.launch(stream=wp.stream_from_torch(torch.cuda.current_stream(device)))
+        return lambda: launch.launch(stream=torch_stream(device))
     return launch.launch

@@ -14,6 +14,7 @@ from pace.sim.engine import make_engine, resolve_device
 from pace.sim.kinematics import Kinematics
 from pace.sim.randomization import Randomizer
 from pace.sim.robot import JOINT_NAMES, build_model, nominal_pose
+from pace.sim.sharing import record
 
 
 @dataclass(frozen=True)
@@ -47,13 +48,13 @@ class RobotState:
 
 @wp.kernel
 def _derive(
-    qpos: wp.array3d(dtype=wp.float32),
-    qvel: wp.array3d(dtype=wp.float32),
+    qpos: wp.array3d[float],
+    qvel: wp.array3d[float],
     last: int,
     inverse_dt: float,
-    gravity: wp.array2d(dtype=wp.float32),
-    heading: wp.array2d(dtype=wp.float32),
-    acceleration: wp.array2d(dtype=wp.float32),
+    gravity: wp.array2d[float],
+    heading: wp.array2d[float],
+    acceleration: wp.array2d[float],
 ):
     """Gravity in the body frame, heading on the ground and mean joint acceleration of one world."""
     world = wp.tid()
@@ -134,23 +135,13 @@ class Worlds:
         self._targets = torch.zeros(n, self.config.substeps, joints, device=device)
         self._new_share = torch.zeros(n, self.config.substeps, 1, device=device)
         self._applied = torch.zeros(n, self.model.nv, device=device)
+        self._reaction, self._reaction_point = torch.zeros(n, 3, device=device), torch.zeros(n, 3, device=device)
         starts = torch.arange(1, self.config.substeps + 1, device=device, dtype=torch.float32)
         self._substep_ends = (starts * self.config.engine.physics_dt).unsqueeze(0)
-        self._derive_command = wp.launch(
-            _derive,
-            dim=n,
-            inputs=[
-                wp.from_torch(self.engine.qpos_path),
-                wp.from_torch(self.engine.qvel_path),
-                self.config.substeps,
-                1.0 / self.control_dt,
-                wp.from_torch(self._gravity),
-                wp.from_torch(self._heading),
-                wp.from_torch(self._acceleration),
-            ],
-            device=wp.device_from_torch(self.device),
-            record_cmd=True,
-        )
+        paths = [wp.from_torch(self.engine.qpos_path), wp.from_torch(self.engine.qvel_path)]
+        derived = [wp.from_torch(t) for t in (self._gravity, self._heading, self._acceleration)]
+        inputs = [*paths, self.config.substeps, 1.0 / self.control_dt, *derived]
+        self._derive = record(_derive, n, inputs, self.device)
         self.robot = self._robot_state()
         self._update_delay()
 
@@ -206,12 +197,14 @@ class Worlds:
         """
         events = self.ball.events
         on_blade = self.robot.paddle_position + events.hit_offset + (events.hit_point - events.hit_position)
-        point = torch.where((events.paddle_hit > 0).unsqueeze(-1), on_blade, events.impulse_point)
-        self.kinematics.paddle_generalized_force(events.paddle_impulse / self.control_dt, point, self._applied)
+        struck = (events.paddle_hit > 0).unsqueeze(-1)
+        torch.where(struck, on_blade, events.impulse_point, out=self._reaction_point)
+        torch.div(events.paddle_impulse, self.control_dt, out=self._reaction)
+        self.kinematics.paddle_generalized_force(self._reaction, self._reaction_point, self._applied)
 
     def _observe(self) -> None:
         self.kinematics.update(self.engine.qpos_path, self.engine.qvel_path)
-        self._derive_command.launch()
+        self._derive()
 
     def _update_delay(self) -> None:
         """Share of each physics step that is left once the new target has passed the actuator delay."""
