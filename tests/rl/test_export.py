@@ -1,0 +1,312 @@
+"""The exported policy: what it computes, what it says about itself, and the example that plays it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from importlib.util import module_from_spec, spec_from_file_location
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from saved import make_agent, make_config, save_run
+
+from pace.config import ConfigError, ExportConfig, TrainConfig, compose, load_train_config, parse
+from pace.predictor.network import PredictorNetwork
+from pace.rl import export
+from pace.rl.deployed import INPUTS, OUTPUT_NAMES, BallTracks, DeployedPolicy, PaddleChain, base_rotation, input_shapes
+from pace.rl.export import ExportError, RawReadings, compare, export_policy, open_session
+from pace.rl.loading import TaskPolicy, built_in_policy, load_policy, policy_size
+from pace.rl.observations import BallTrack
+from pace.rl.policy import Policy
+from pace.sim.ball import BallParams, BallSim, ball_preset
+from pace.sim.kinematics import Kinematics
+from pace.sim.robot import JOINT_NAMES, build_model
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "deploy_sim2sim.py"
+
+
+def options(*overrides: str) -> ExportConfig:
+    return parse(compose("export", ["run=any", "check_worlds=4", "check_steps=110", *overrides]), ExportConfig)
+
+
+def make_model(config: TrainConfig) -> mujoco.MjModel:
+    return build_model(config.robot, config.engine, config.ball.table)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return save_run(tmp_path_factory.mktemp("run"))
+
+
+@pytest.fixture(scope="module")
+def exported(run: Path) -> tuple[Path, dict[str, float]]:
+    """The file, and how far it is from torch."""
+    pytest.importorskip("onnxscript")
+    file = run / "policy.onnx"
+    return file, export_policy(load_policy(run), file, options())
+
+
+@pytest.fixture(scope="module")
+def example() -> Any:
+    """The example as a module."""
+    spec = spec_from_file_location("deploy_sim2sim", EXAMPLE)
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def stored(file: Path) -> dict[str, Any]:
+    return {name: json.loads(text) for name, text in open_session(file).get_modelmeta().custom_metadata_map.items()}
+
+
+def test_it_computes_what_the_task_computes(exported: tuple[Path, dict[str, float]]) -> None:
+    file, differences = exported
+    names = ["joint_target", "action", "predicted_apex", "predicted_target", "predicted_time", "something_to_hit"]
+    assert list(differences) == names
+    assert max(differences.values()) < 1e-5
+    session = open_session(file)
+    assert [port.name for port in session.get_inputs()] == list(INPUTS)
+    assert tuple(port.name for port in session.get_outputs()) == OUTPUT_NAMES
+    assert stored(file)["check"]["largest_difference"] == differences
+    assert list(file.parent.glob(".export_*")) == []
+
+
+def test_the_metadata_is_what_a_robot_needs(exported: tuple[Path, dict[str, float]], run: Path) -> None:
+    meta, config = stored(exported[0]), make_config()
+    model = make_model(config)
+    assert meta["joint_names"] == list(JOINT_NAMES)
+    assert meta["nominal_pose"] == pytest.approx(model.key_qpos[0, 7:].tolist())
+    assert meta["kp"] == pytest.approx(model.actuator_gainprm[:, 0].tolist())
+    assert meta["kd"] == pytest.approx((-model.actuator_biasprm[:, 2]).tolist())
+    assert meta["effort"] == pytest.approx(model.actuator_forcerange[:, 1].tolist())
+    assert (meta["action_scale"], meta["control_dt"], meta["armature"]) == (0.25, 0.02, 0.01)
+    assert (meta["sensing"]["ball_position"], meta["sensing"]["mocap_delay"]) == (0.007, [0.004, 0.01])
+    assert meta["actuator_delay"] == [0.0, 0.006]
+    assert meta["config"]["reward"]["scale"] == 0.125  # of the run, not of configs/
+    assert meta["observation"]["history"] * meta["observation"]["frame"]["something_to_hit"][1] == policy_size(config)
+    assert meta["inputs"]["ball_position"]["shape"] == [9, 3]
+    assert {name: tuple(port["shape"]) for name, port in meta["inputs"].items()} == input_shapes(config)
+    assert meta["counters"]["updates"] == 3
+    assert meta["source"].startswith(str(run))
+    assert len(meta["git"]["commit"]) == 40
+
+
+def fresh_policy(overrides: Sequence[str]) -> TaskPolicy:
+    """A policy of random weights on another task."""
+    config = load_train_config(["algo.actor_hidden=[8]", "algo.critic_hidden=[8]", "algo.autocast=fp32", *overrides])
+    network = Policy.build(policy_size(config), 21, config.algo)
+    network.load_agent(make_agent(config).state_dict())
+    return TaskPolicy(config, network.eval(), PredictorNetwork(config.predictor), "fresh")
+
+
+class TorchSession:
+    """The graph before it became a file."""
+
+    def __init__(self, policy: TaskPolicy) -> None:
+        self.graph = DeployedPolicy(policy, make_model(policy.config))
+
+    @torch.no_grad()
+    def run(self, _: None, inputs: dict[str, np.ndarray]) -> list[np.ndarray]:
+        return [output.numpy() for output in self.graph(*(torch.from_numpy(inputs[name]) for name in INPUTS))]
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ("observation=paper", "predictor=paper", "reward=paper"),
+        ("predictor.enabled=false", "observation.policy_history=1"),
+    ],
+)
+def test_other_tasks_have_their_own_graph(overrides: tuple[str, ...]) -> None:
+    policy = fresh_policy(overrides)
+    differences = compare(TorchSession(policy), policy, options("check_steps=60"))
+    assert max(differences.values()) < 1e-5
+
+
+def test_a_wrong_file_is_not_kept(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(export, "save_graph", lambda graph, config, file: file.touch())
+    monkeypatch.setattr(export, "open_session", lambda file: None)
+    monkeypatch.setattr(export, "compare", lambda *_: {"joint_target": 2e-4})
+    with pytest.raises(ExportError, match=r"differ by 0\.0002"):
+        export_policy(load_policy(run), tmp_path / "policy.onnx", options())
+    monkeypatch.setattr(export, "compare", lambda *_: {"joint_target": float("nan")})
+    with pytest.raises(ExportError, match="differ by nan"):
+        export_policy(load_policy(run), tmp_path / "policy.onnx", options())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_bad_input_is_one_line(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for arguments, status, message in (
+        ([], 2, "which run?"),
+        (["/nowhere"], 1, "does not exist"),
+        ([str(run), f"out={tmp_path}"], 1, "is a folder"),
+        ([str(run), "speed=1"], 2, "speed"),
+    ):
+        monkeypatch.setattr("sys.argv", ["export", *arguments])
+        assert export.main() == status
+        error = capsys.readouterr().err.strip()
+        assert error.startswith("error: ")
+        assert message in error
+        assert "\n" not in error
+    with pytest.raises(ConfigError, match="check_steps"):
+        options("check_steps=0")
+    with pytest.raises(TypeError, match="zero is no network"):
+        DeployedPolicy(built_in_policy("zero", 1), make_model(make_config()))
+
+
+def test_paddle_and_base_as_the_kernels_have_them() -> None:
+    torch.manual_seed(2)
+    model, count = make_model(make_config()), 50
+    position, joints = torch.randn(count, 3), torch.randn(count, 21)
+    quat = torch.nn.functional.normalize(torch.randn(count, 4), dim=1)
+    quat[:, 1:3] *= 0.4  # heading and gravity describe all but a base that lies on its nose
+    quat = torch.nn.functional.normalize(quat, dim=1)
+    matrix = np.zeros((count, 9))
+    for row, q in zip(matrix, quat.double().numpy(), strict=True):
+        mujoco.mju_quat2Mat(row, q)
+    truth = torch.from_numpy(matrix).float().view(count, 3, 3)
+    rotation = base_rotation(-truth[:, 2], truth[:, :2, 0])
+    assert torch.allclose(rotation, truth, atol=1e-5)
+    centre, normal = PaddleChain(model)(position, rotation, joints)
+    expected = Kinematics(model, count, 1, "cpu").paddle_pose(position, quat, joints)
+    assert torch.allclose(centre, expected[0], atol=1e-5)
+    assert torch.allclose(normal, expected[1], atol=1e-5)
+
+
+def test_the_ball_is_followed_as_in_the_task() -> None:
+    torch.manual_seed(3)
+    config, worlds = make_config(), 64
+    track = BallTrack(config.predictor.frames, config.reward.nothing_to_hit, worlds, torch.device("cpu"))
+    graph, frames = BallTracks(config), config.predictor.frames
+    length = frames + config.observation.policy_history - 1
+    sensed = torch.tensor([0.0, 0.0, 1.0]).repeat(worlds, 1)
+    track.restart(torch.ones(worlds, dtype=torch.bool), sensed)
+    positions, launched = sensed.unsqueeze(1).repeat(1, length, 1), torch.zeros(worlds, length, 1)
+    bit, seen = torch.zeros(worlds, 1), 0
+    for _ in range(60):
+        new = torch.rand(worlds) < 0.05
+        sensed += torch.tensor([-0.05, 0.0, 0.0]) + 0.04 * torch.randn(worlds, 3)
+        sensed[new] = torch.tensor([0.0, 0.0, 1.1])
+        track.update(sensed, new)
+        positions = torch.cat((positions[:, 1:], sensed.unsqueeze(1)), dim=1)
+        launched = torch.cat((launched[:, 1:], new.float().view(-1, 1, 1)), dim=1)
+        tracks, hittable, next_bit = graph(positions, launched, bit.unsqueeze(1))
+        bit = next_bit.float()
+        assert torch.equal(tracks[:, -1], track.positions)
+        assert torch.equal(hittable[:, -1], track.something_to_hit)
+        seen += int(track.something_to_hit.sum())
+    assert 0.2 < seen / (60 * worlds) < 0.8  # both answers were asked for
+
+
+def test_the_example_gives_the_targets_of_the_task(exported: tuple[Path, dict[str, float]], example: Any) -> None:
+    controller = example.Controller(exported[0])
+    policy = load_policy(exported[0].parent)
+    env = policy.make_env(1, "cpu", 4, ["sensing.base_shift=0.0", "engine.threads=1", "serve.serves_per_episode=0"])
+    new_ball, restarts, serves = False, 0, 0
+    for _ in range(200):
+        frame = {name: value[0].numpy() for name, value in RawReadings(env, policy.config).read().items()}
+        action = policy(env.policy_observation)
+        expected = env.worlds.nominal + 0.25 * action[0]
+        found = controller({name: value for name, value in frame.items() if name != "previous_action"}, new_ball)
+        assert np.abs(found - expected.numpy()).max() < 1e-5
+        assert np.abs(controller.outputs["predicted_apex"] - env.actor.apex[0].numpy()).max() < 1e-5
+        env.advance(action)
+        new_ball = bool(env.game.ends.next_serve)
+        serves += new_ball
+        if bool(env.terminated):
+            env.reset_worlds(env.terminated)
+            controller.restart()
+            restarts += 1
+    assert restarts + serves > 0
+
+
+def far_blade(example: Any) -> Any:
+    """A paddle that is in nobody's way."""
+    return example.Blade(np.array([0.0, 0.0, 9.0]), np.array([1.0, 0.0, 0.0]), np.zeros(3), np.zeros(3))
+
+
+def test_the_example_flies_the_same_ball(example: Any) -> None:
+    preset = ball_preset("venue")  # with lift
+    sim = BallSim(1, "cpu", BallParams.from_config(preset), preset.table, 0.002, 1, 0.002)
+    velocity, spin = np.array([-5.8, -0.2, 1.7]), np.array([20.0, 60.0, -30.0])
+    ahead, ball = (example.Ball({**vars(preset), "table": vars(preset.table)}) for _ in range(2))
+    for each in (ahead, ball):
+        each.serve(example.SERVE_START, velocity)
+        each.spin = spin
+    for _ in range(550):
+        ahead.step(0.001, far_blade(example), far_blade(example))
+    for tensor, value in ((sim.position, ball.position), (sim.velocity, velocity), (sim.spin, spin)):
+        tensor[0] = torch.from_numpy(value)
+    normal, speed, turning = np.array([0.96, 0.0, 0.28]), np.array([1.5, 0.2, 0.5]), np.array([0.0, 2.0, 0.0])
+    surfaces: list[str] = []
+    for step in range(400):  # the paddle's centre comes to where the ball is at 0.55 s
+        times = [0.002 * step - 0.55 + dt for dt in (0.0, 0.001, 0.002)]
+        blades = [example.Blade(ahead.position + time * speed, normal, speed, turning) for time in times]
+        sim.fly(torch.from_numpy(np.stack([np.concatenate(blades[i]) for i in (0, 2)])).float().unsqueeze(0))
+        surfaces += [contact.surface for a, b in pairwise(blades) for contact in ball.step(0.001, a, b)]
+        assert np.abs(ball.position - sim.position[0].numpy()).max() < 0.004, (step, surfaces)
+    assert surfaces == ["own", "paddle"]
+    assert ball.velocity[0] > 2.5
+    assert np.abs(ball.velocity - sim.velocity[0].numpy()).max() < 0.05
+    assert np.abs(ball.spin - sim.spin[0].numpy()).max() < 3.0
+
+
+def test_the_example_needs_no_pace_and_outruns_the_clock(exported: tuple[Path, dict[str, float]]) -> None:
+    code = (
+        "import runpy, sys\n"
+        f"sys.argv = ['x', {str(exported[0])!r}, '--serves', '3', '--seed', '2']\n"
+        f"try:\n    runpy.run_path({str(EXAMPLE)!r}, run_name='__main__')\n"
+        "except SystemExit as end:\n    assert end.code == 0, end.code\n"
+        "loaded = {name.split('.')[0] for name in sys.modules}\n"
+        "print(sorted(loaded & {'torch', 'pace', 'warp', 'onnx', 'scipy'}))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.strip().splitlines()
+    assert lines[1].startswith("3 serves: hit ")
+    assert float(lines[2].split(": ")[1].split(" ")[0]) > 1.0
+    assert lines[3] == "[]"
+
+
+def test_the_example_refuses_other_files(tmp_path: Path) -> None:
+    (tmp_path / "x.onnx").write_text("nothing")
+    for file in (tmp_path / "x.onnx", tmp_path / "nowhere.onnx"):
+        done = subprocess.run([sys.executable, str(EXAMPLE), str(file)], capture_output=True, text=True, timeout=100)
+        assert done.returncode == 1
+        assert done.stderr.startswith(f"error: {file} cannot be used")
+        assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_the_referee_of_the_example(example: Any) -> None:
+    for surfaces, hit, outcome in (
+        (["own", "paddle", "opponent"], True, "success"),
+        (["own", "paddle", "net", "own"], True, "own side"),
+        (["own", "paddle", "floor", "paddle"], True, "out"),
+        (["own", "own", "paddle"], False, "miss"),
+        (["paddle"], False, "volley"),
+        (["opponent", "floor"], False, "miss"),
+    ):
+        referee = example.Referee()
+        for surface in surfaces:
+            referee.see(example.Contact(surface, np.zeros(3), np.zeros(3), np.zeros(3)))
+        assert (referee.hit, referee.outcome) == (hit, outcome), surfaces
+
+
+def test_a_shorter_history_of_the_policy_keeps_the_balls() -> None:
+    config = make_config()
+    short = replace(config, observation=replace(config.observation, policy_history=2))
+    assert input_shapes(short)["ball_position"] == (6, 3)
+    assert input_shapes(short)["joint_position"] == (2, 21)
