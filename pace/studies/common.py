@@ -1,0 +1,73 @@
+"""What the studies share: configuration, robots on an engine, and tables."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from functools import lru_cache
+
+import mujoco
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pace.config import TrainConfig, load_train_config
+from pace.sim.robot import JOINT_NAMES, build_model
+
+Array = NDArray[np.float64]
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")  # told apart by all kinds of vision
+#: Columns of the joints that carry the paddle: waist and right arm.
+ARM = [i for i, name in enumerate(JOINT_NAMES) if name == "Waist" or name.startswith(("Right_Sh", "Right_El"))]
+
+
+@lru_cache
+def _clean_config() -> TrainConfig:
+    return load_train_config(["randomization=none", "engine=native", "device=cpu"])
+
+
+def study_config(**engine: object) -> TrainConfig:
+    """The training configuration without randomisation, on one thread, with values of ``engine`` changed."""
+    config = _clean_config()
+    options: dict[str, object] = {"threads": 1} | engine
+    return dataclasses.replace(config, engine=dataclasses.replace(config.engine, **options))  # type: ignore[arg-type]
+
+
+def standing(config: TrainConfig, num_worlds: int) -> Tensor:
+    """States (N, 28): nominal pose, soles on the floor, behind the table."""
+    model = build_model(config.robot, config.engine, config.ball.table)
+    qpos = torch.as_tensor(model.key_qpos[0], dtype=torch.float32).repeat(num_worlds, 1)
+    qpos[:, 0] = -2.0
+    return qpos
+
+
+def smooth_swings(nominal: Tensor, num_worlds: int, steps: int, seed: int, arm: float, rest: float) -> Tensor:
+    """Joint targets (T, N, 21) rad round ``nominal`` (21,): a sum of three sines of 0.5 to 2.5 Hz a joint.
+
+    ``arm`` is the amplitude of the joints that carry the paddle, ``rest`` that of all others.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    joints = nominal.shape[0]
+    draw = torch.rand(3, 3, num_worlds, joints, generator=generator)
+    phase, frequency, share = 2 * np.pi * draw[0], 0.5 + 2.0 * draw[1], draw[2]
+    time = 0.02 * torch.arange(steps).view(-1, 1, 1, 1)
+    wave = (share * torch.sin(2 * np.pi * frequency * time + phase)).sum(1)
+    amplitude = torch.full((joints,), rest)
+    amplitude[ARM] = arm
+    return nominal + amplitude * wave
+
+
+def model_of(config: TrainConfig) -> mujoco.MjModel:
+    """The robot's model with the engine options of ``config``."""
+    return build_model(config.robot, config.engine, config.ball.table)
+
+
+def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table for a page of ``docs/``."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def quantiles(values: Array) -> tuple[float, float]:
+    """Median and 95 % quantile of all values."""
+    return float(np.median(values)), float(np.quantile(values, 0.95))
