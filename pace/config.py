@@ -186,6 +186,8 @@ class RewardConfig:
 
     def __post_init__(self) -> None:
         _require(self.target_mode in ("intercept", "clamp"), "reward.target_mode must be intercept or clamp")
+        given, needed = sorted(self.nothing_to_hit), ["falling_x", "low_z", "past_x"]
+        _require(given == needed, f"reward.nothing_to_hit needs exactly {', '.join(needed)}; got {', '.join(given)}")
 
 
 @dataclass
@@ -231,6 +233,9 @@ class SensingConfig:
     heading: float
     base_shift: float  # m
     mocap_delay: Range  # s, drawn per world at reset: ball, base position and heading
+
+    def __post_init__(self) -> None:
+        _check_range("sensing.mocap_delay", self.mocap_delay, lowest=0.0)
 
 
 @dataclass
@@ -381,6 +386,7 @@ class TrainConfig(TaskConfig):
     def __post_init__(self) -> None:
         _require(self.num_worlds >= 1, f"num_worlds must be at least 1, got {self.num_worlds}")
         _require(self.samples > 0, "samples must be positive")
+        _require(self.minutes >= 0, f"minutes must not be negative (0: no limit), got {self.minutes}")
         _require(not (self.resume and self.init_from), "give resume or init_from, not both")
 
 
@@ -488,6 +494,34 @@ class ExportConfig:
         _require(self.run is not None, "which run? give its folder, a checkpoint or pretrained/<name>")
         for name in ("check_worlds", "check_steps"):
             _require(getattr(self, name) >= 1, f"{name} must be at least 1, got {getattr(self, name)}")
+
+
+@dataclass
+class PlayConfig:
+    """``python -m pace.rl.play``: which policy, where it is shown, or what is filmed."""
+
+    run: str | None
+    host: str
+    port: int
+    speed: float  # of time; 1: real time
+    seed: int
+    physics_dt: float  # s
+    overrides: list[str]  # of the saved task
+    video: str | None
+    seconds: float  # of play
+    width: int  # pixels of each view
+    height: int
+    fps: float
+
+    def __post_init__(self) -> None:
+        _require(self.run is not None, "which run? give its folder, a checkpoint or pretrained/<name>")
+        _require(0 < self.speed <= 1, f"speed must lie in (0, 1], got {self.speed}")
+        _require(1 <= self.port <= 65535, f"port must lie in 1 to 65535, got {self.port}")
+        for name in ("seconds", "fps"):
+            _require(getattr(self, name) > 0, f"{name} must be positive, got {getattr(self, name)}")
+        for name in ("width", "height"):
+            value = getattr(self, name)
+            _require(value > 0 and value % 2 == 0, f"{name} must be an even number of pixels, got {value}")
 
 
 def parse(config: DictConfig | dict[str, Any], schema: type[T]) -> T:

@@ -160,9 +160,11 @@ def plot_learning_curve(run_dir: str | Path) -> Path | None:
             smooth = moving_average(metrics[column], CURVE_WINDOW)
             axes.plot(millions, [factor * value for value in smooth], label=name)
         axes.set_ylabel(label)
+        axes.update_datalim([(millions[0], 0.0)])  # zero is in view, and the margin above is one of the whole height
+        axes.autoscale_view()
         axes.set_ylim(bottom=0)
         axes.grid(alpha=0.3)
-        axes.legend(loc="upper left")
+        axes.legend(loc="best")
     axes.set_xlabel(f"control steps, millions (mean of {CURVE_WINDOW} updates)")
     file = Path(run_dir) / CURVE
     figure.savefig(file, dpi=110)

@@ -119,19 +119,14 @@ class Referee(Part):
         self.hit, self.touched, self.rim, self.net_touched = (flag.clone() for flag in flags[:4])
         self.was_open, self.hit_now, self.success_now = (flag.clone() for flag in flags[4:])
 
-    @property
-    def is_open(self) -> Tensor:
-        """Whether the serve is undecided (N,) bool."""
-        return self.outcome == Outcome.OPEN
-
 
 class Target(Part):
     """Where and when the paddle should meet the ball: from the forecast of the serve. World frame, serve clock.
 
     Attributes: ``playable`` (N,) bool, ``apex`` (N, 3) m, ``apex_time`` (N,) s, ``point`` (N, 3) m the paddle's
     target, ``time`` (N,) s when the ball is there; ``something_to_hit`` (N,) bool, the ball can still be hit legally;
-    ``idle_point`` (3,) m: a target to stand by while there is nothing
-    to hit, the one that belongs to the idle base position.
+    ``idle_point`` (3,) m: a target to stand by while there is nothing to hit, the one that belongs to the idle base
+    position.
     """
 
     def __init__(self, config: RewardConfig, num_worlds: int, device: torch.device) -> None:

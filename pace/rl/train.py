@@ -69,7 +69,7 @@ def resumed_config(saved: Checkpoint, path: str, overrides: list[str]) -> TrainC
     config.resume, config.init_from = path, None
     if saved.counters["samples"] >= config.samples:
         raise ConfigError(f"{path} has {saved.counters['samples']} samples: give samples= above that to go on")
-    if saved.path is not None and config.run_dir is None:
+    if saved.path is not None:  # where the run lies now; it may have been moved or copied since it was saved
         config.run_dir = str(saved.path.parent.parent)
     return config
 

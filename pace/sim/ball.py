@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from functools import lru_cache
-from typing import TypeVar
 
 import torch
 import warp as wp
@@ -24,7 +23,7 @@ from pace.sim.ball_kernels import (
 )
 from pace.sim.flight import Scene
 from pace.sim.rebound import Material
-from pace.sim.sharing import torch_stream
+from pace.sim.sharing import share, share_all, torch_stream
 
 __all__ = ["FORECAST_HORIZON", "BallEvents", "BallParams", "BallSim", "Forecast", "ball_preset"]
 
@@ -37,7 +36,6 @@ NET_THICKNESS = 0.002
 PATH_WIDTH = 12
 
 Value = float | Tensor
-T = TypeVar("T")
 
 
 @lru_cache
@@ -196,21 +194,6 @@ class Forecast:
         return cls(**tensors)
 
 
-def _share(tensor: Tensor) -> wp.array:
-    """The Warp array on a tensor's memory; rows of three are vectors."""
-    if tensor.dtype == torch.float32 and tensor.dim() == 2 and tensor.shape[1] == 3:
-        return wp.from_torch(tensor, dtype=wp.vec3)
-    return wp.from_torch(tensor)
-
-
-def _share_all(tensors: BallEvents | Forecast, arrays: type[T]) -> T:
-    """A Warp struct of arrays on the memory of the tensors of the same names."""
-    struct = arrays()
-    for f in fields(tensors):
-        setattr(struct, f.name, _share(getattr(tensors, f.name)))
-    return struct
-
-
 def _material(restitution: float, friction: float) -> Material:
     material = Material()
     material.restitution = restitution
@@ -289,7 +272,7 @@ class BallSim:
     def _record(self, ball_dt: float) -> None:
         """Record both launches, so that a call only replays them."""
         device = wp.device_from_torch(self.device)
-        ball = [_share(self.position), _share(self.velocity), _share(self.spin)]
+        ball = [share(self.position), share(self.velocity), share(self.spin)]
         params = wp.from_torch(self._param_matrix)
         self._fly_launch = wp.launch(
             fly_step,
@@ -298,8 +281,8 @@ class BallSim:
                 *ball,
                 params,
                 self._scene,
-                _share_all(self.events, EventArrays),
-                _share(self.nearest_paddle_distance),
+                share_all(EventArrays, vars(self.events)),
+                share(self.nearest_paddle_distance),
                 self.control_dt,
                 ball_dt,
             ],
@@ -310,11 +293,11 @@ class BallSim:
             forecast_flight,
             dim=self.num_worlds,
             inputs=[
-                _share(self._ask_mask),
-                *(_share(tensor) for tensor in self._ask),
+                share(self._ask_mask),
+                *(share(tensor) for tensor in self._ask),
                 params,
                 self._scene,
-                _share_all(self.forecast_result, ForecastArrays),
+                share_all(ForecastArrays, vars(self.forecast_result)),
                 0.0,
                 ball_dt,
             ],

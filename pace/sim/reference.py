@@ -111,7 +111,6 @@ class ReferenceServe:
     bounce_time: Array  # s
     bounce: Array  # m, centre
     bounce_velocity: Array  # m/s, after
-    bounce_spin: Array  # rad/s, after
     apex_time: Array  # s
     apex: Array  # m
 
@@ -136,7 +135,7 @@ def fly_serve(
         return velocity[:, 2], ball.acceleration(velocity, after_spin)[:, 2]
 
     rise_time, apex, _ = fly_until(ball, bounce, after, after_spin, level, after[:, 2] / -GRAVITY[2])
-    return ReferenceServe(bounce_time, bounce, after, after_spin, bounce_time + rise_time, apex)
+    return ReferenceServe(bounce_time, bounce, after, bounce_time + rise_time, apex)
 
 
 @dataclass(frozen=True)

@@ -129,7 +129,7 @@ def test_starts_lie_in_the_configured_ranges() -> None:
     assert bool(((base[:, 0] >= reset.base_x[0]) & (base[:, 0] <= reset.base_x[1])).all())
     torch.testing.assert_close(env.worlds.ball.position[:, 0], torch.full((N,), 1.35))
     assert not env.game.clock.time.any()
-    assert bool(env.game.referee.is_open.all())
+    assert bool((env.game.referee.outcome == Outcome.OPEN).all())
 
 
 def test_a_fall_terminates_and_the_serve_counts_as_a_fall() -> None:

@@ -88,3 +88,11 @@ def test_a_resumed_run_keeps_its_task(train, tmp_path: Path, capsys: pytest.Capt
     assert "'algo.gamma' cannot change in a resumed run" in capsys.readouterr().err
     assert train(f"resume={tmp_path}", "progress=false") == 2
     assert "give samples= above that" in capsys.readouterr().err
+
+
+def test_a_run_that_was_moved_goes_on_where_it_lies(train, tmp_path: Path) -> None:
+    assert real_run(train, tmp_path / "old", 1) == 0
+    (tmp_path / "old").rename(tmp_path / "moved")
+    assert train(f"resume={tmp_path / 'moved'}", f"samples={2 * UPDATE}", "progress=false") == 0
+    assert not (tmp_path / "old").exists()
+    assert read_metrics(tmp_path / "moved" / "metrics.csv")["update"] == [1, 2]
