@@ -192,11 +192,21 @@ def prune_checkpoints(run_dir: Path, keep: int) -> None:
         shutil.rmtree(folder)
 
 
+#: Keys that say where and how a run was made, not what it learned: a kept policy has their defaults.
+RUN_KEYS: dict[str, Any] = {"device": "auto", "run_dir": None, "resume": None, "init_from": None}
+
+
 def export_weights(path: str | Path, folder: str | Path) -> Path:
-    """Copy a checkpoint's weights and configuration without its training state, for ``pretrained/``."""
+    """Copy a checkpoint's weights and configuration without its training state, for ``pretrained/``.
+
+    Folders and the number of threads of the machine that trained it are left out of the configuration.
+    """
     checkpoint = load_checkpoint(path, weights_only=True)
     slim = {part: {k: _single(v) for k, v in tensors.items()} for part, tensors in checkpoint.weights.items()}
-    return save_checkpoint(Path(folder), Checkpoint(checkpoint.config, checkpoint.counters, slim, None))
+    config = checkpoint.config | {key: value for key, value in RUN_KEYS.items() if key in checkpoint.config}
+    if "engine" in config:
+        config["engine"] = config["engine"] | {"name": "auto", "threads": 0}
+    return save_checkpoint(Path(folder), Checkpoint(config, checkpoint.counters, slim, None))
 
 
 def _single(tensor: Tensor) -> Tensor:
