@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import csv
-import os
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 from pace.config import BenchConfig, load_train_config
 from pace.rl.run_folder import METRICS
 
+POLL_SECONDS = 0.1  # of the memory's high-water mark, which never falls while a process runs
 WARM_UP_ROWS = 2  # updates that do not count: compilation, allocation
 PAPER_NETWORKS = {"algo": "paper", "observation": "paper"}  # default physics and task, the paper's networks and critic
 
@@ -63,15 +64,30 @@ def training_run(num_worlds: int, updates: int, overrides: list[str]) -> tuple[f
 
 
 def _peak_mib(command: list[str], output: Path) -> float:
+    peak = 0.0
     with output.open("w") as file:
         process = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT)
-        _, status, usage = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
+        while process.poll() is None:
+            peak = max(peak, _resident_peak_mib(process.pid))
+            time.sleep(POLL_SECONDS)
     if process.returncode != 0:
         tail = "\n".join(output.read_text().splitlines()[-15:])
         raise BenchError(f"{' '.join(command)} ended with status {process.returncode}:\n{tail}")
-    unit = 1 if sys.platform == "darwin" else 1024  # bytes there, KiB elsewhere
-    return usage.ru_maxrss * unit / 2**20
+    return peak
+
+
+def _resident_peak_mib(pid: int) -> float:
+    """High-water mark of a process that runs; 0 when it has just ended.
+
+    Linux counts the parent's own peak into a child's ``ru_maxrss`` (it is kept over exec), so that cannot be used.
+    """
+    try:
+        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    except FileNotFoundError:
+        if not Path("/proc/self/status").exists():
+            raise BenchError("peak memory is read from /proc: leave train and memory out of bench.parts") from None
+        return 0.0
+    return max((float(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM")), default=0.0)
 
 
 def steady_rate(metrics: Path) -> float:
