@@ -272,6 +272,9 @@ class EngineConfig:
         _require(self.name in ("auto", "native", "mjwarp"), f"engine must be auto, native or mjwarp, not {self.name!r}")
         _require(self.physics_dt > 0, "engine.physics_dt must be positive")
         _require(self.cone in ("pyramidal", "elliptic"), "engine.cone must be pyramidal or elliptic")
+        _require(self.threads >= 0, "engine.threads must be 0 (all cores) or more")
+        for name in ("solver_iterations", "line_search_iterations", "contacts_per_world", "constraints_per_world"):
+            _require(getattr(self, name) >= 1, f"engine.{name} must be at least 1")
 
 
 @dataclass

@@ -121,6 +121,8 @@ def test_missing_key_is_named(key: str) -> None:
         ("ball.mass=0", "ball.mass must be positive"),
         ("engine.physics_dt=0", "engine.physics_dt must be positive"),
         ("engine.name=bullet", "engine must be auto, native or mjwarp"),
+        ("engine.threads=-1", "engine.threads must be 0"),
+        ("engine.contacts_per_world=0", "engine.contacts_per_world must be at least 1"),
         ("engine.cone=round", "engine.cone must be pyramidal or elliptic"),
         ("algo.gamma=1.1", r"algo.gamma must lie in \(0, 1\]"),
         ("algo.minibatches=0", "algo.minibatches must be at least 1"),

@@ -16,6 +16,9 @@ from typing import Any
 from omegaconf import OmegaConf
 from torchrl.record.loggers.tensorboard import TensorboardLogger
 
+from pace.config import ConfigError
+from pace.rl.checkpoint import list_checkpoints
+
 CONFIG, VERSIONS, METRICS, CURVE = "config.yaml", "versions.json", "metrics.csv", "learning_curve.png"
 PACKAGES = ("torch", "torchrl", "tensordict", "mujoco", "mujoco-warp", "warp-lang", "numpy", "hydra-core")
 LEADING = (
@@ -68,16 +71,32 @@ def git_state(folder: Path) -> dict[str, Any] | None:
 
 
 class RunFolder:
-    """Files of one run. Rows logged twice (after a resume from an older checkpoint) replace the earlier ones."""
+    """Files of one run. Rows that a crashed run logged after ``first_update``, its last checkpoint, are dropped.
+
+    Errors: :class:`ConfigError` for a folder that cannot be made, or that holds a checkpoint later than that.
+    """
 
     def __init__(self, path: str | Path, config: dict[str, Any], tensorboard: bool, first_update: int = 0) -> None:
         self.path = Path(path)
-        self.path.mkdir(parents=True, exist_ok=True)
+        self._claim(first_update)
         (self.path / CONFIG).write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
         (self.path / VERSIONS).write_text(json.dumps(versions(), indent=1))
         self._columns: list[str] = []
         self._file = self._open_metrics(first_update)
         self._board = TensorboardLogger("events", str(self.path)) if tensorboard else None
+
+    def _claim(self, first_update: int) -> None:
+        """Make the folder, which must not hold a checkpoint that the run's own ones would lie behind."""
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigError(f"run_dir {self.path} cannot be made: {error.strerror}") from error
+        last = max((int(folder.name.removeprefix("update_")) for folder in list_checkpoints(self.path)), default=0)
+        if last > first_update:
+            raise ConfigError(
+                f"{self.path} has a checkpoint of update {last}: resume={self.path} goes on from it; "
+                "or give another run_dir, or move it away"
+            )
 
     @property
     def metrics_file(self) -> Path:

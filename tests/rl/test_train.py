@@ -96,3 +96,22 @@ def test_a_run_that_was_moved_goes_on_where_it_lies(train, tmp_path: Path) -> No
     assert train(f"resume={tmp_path / 'moved'}", f"samples={2 * UPDATE}", "progress=false") == 0
     assert not (tmp_path / "old").exists()
     assert read_metrics(tmp_path / "moved" / "metrics.csv")["update"] == [1, 2]
+
+
+def test_a_run_does_not_mix_with_another_in_its_folder(
+    train, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert real_run(train, tmp_path, 2, "checkpoint_minutes=0") == 0
+    metrics = (tmp_path / "metrics.csv").read_text()
+    first = tmp_path / "checkpoints" / "update_00000001"
+    assert real_run(train, tmp_path, 1) == 2
+    assert f"resume={tmp_path} goes on from it" in capsys.readouterr().err
+    assert train(f"resume={first}", f"samples={3 * UPDATE}", "progress=false") == 2
+    assert "checkpoint of update 2" in capsys.readouterr().err
+    assert (tmp_path / "metrics.csv").read_text() == metrics
+
+
+def test_a_folder_that_cannot_be_made_is_one_line(train, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").touch()
+    assert real_run(train, tmp_path / "file" / "run", 1) == 2
+    assert "cannot be made: Not a directory" in capsys.readouterr().err
