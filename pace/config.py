@@ -514,12 +514,13 @@ class PlayConfig:
     seconds: float  # of play
     width: int  # pixels of each view
     height: int
-    fps: float
+    fps: int
 
     def __post_init__(self) -> None:
         _require(self.run is not None, "which run? give its folder, a checkpoint or pretrained/<name>")
         _require(0 < self.speed <= 1, f"speed must lie in (0, 1], got {self.speed}")
         _require(1 <= self.port <= 65535, f"port must lie in 1 to 65535, got {self.port}")
+        _require(self.video is None or self.video.endswith(".mp4"), f"video must end in .mp4, got {self.video}")
         for name in ("seconds", "fps"):
             _require(getattr(self, name) > 0, f"{name} must be positive, got {getattr(self, name)}")
         for name in ("width", "height"):
