@@ -12,7 +12,8 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
 
-from pace.studies import reaction
+from pace.studies import parity, reaction, steps
+from pace.studies.swings import Swings, policy_swings, random_swings
 
 
 def _save(out: Path, name: str, size: tuple[float, float], draw: Callable[[Figure], None]) -> None:
@@ -31,7 +32,31 @@ def study_reaction(options: argparse.Namespace) -> None:
     _save(options.out, "paddle_reaction", (9, 3.2), lambda figure: reaction.draw(strikes, figure))
 
 
-STUDIES = {"reaction": study_reaction}
+def study_parity(options: argparse.Namespace) -> None:
+    found = parity.compare(options.worlds)
+    print(parity.table(found))
+    print()
+    print(parity.strike_table(found))
+    _save(options.out, "engine_parity", (9.5, 3.2), lambda figure: parity.draw(found, figure))
+
+
+def _swings(options: argparse.Namespace) -> Swings:
+    swings = policy_swings(options.run, options.worlds, 150) if options.run else random_swings(options.worlds, 150)
+    print(f"{swings.source}, {options.worlds} worlds for {0.02 * len(swings.targets):g} s")
+    return swings
+
+
+def study_steps(options: argparse.Namespace) -> None:
+    cases = steps.step_cases(_swings(options).windows(steps.LENGTH))
+    print(steps.table(cases))
+    _save(options.out, "step_size", (9.5, 3.2), lambda figure: steps.draw_steps(cases, figure))
+
+
+def study_solver(options: argparse.Namespace) -> None:
+    print(steps.table(steps.solver_cases(_swings(options).windows(steps.LENGTH))))
+
+
+STUDIES = {"reaction": study_reaction, "parity": study_parity, "steps": study_steps, "solver": study_solver}
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -39,6 +64,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m pace.studies", description=__doc__)
     parser.add_argument("studies", nargs="*", choices=[*STUDIES, []], help="which; none: all")
     parser.add_argument("--worlds", type=int, default=16, help="worlds of each case")
+    parser.add_argument("--run", type=Path, help="run folder or checkpoint whose swings to replay; none: random swings")
     parser.add_argument("--out", type=Path, default=Path("docs/figures"), help="folder of the figures")
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)

@@ -13,11 +13,11 @@ from torch import Tensor
 
 from pace.sim.worlds import Worlds
 from pace.studies.common import COLOURS, Array, markdown, smooth_swings, standing, study_config
+from pace.studies.throws import throw
 
 SPEEDS = (4.0, 6.0, 8.0, 10.0, 12.0)  # m/s, ball against blade along the normal
 SWING_STEPS = 20  # control steps before the strike
 FOLLOW_STEPS = 10  # after it
-MEETING = 0.01  # s into a control step
 SEED = 3
 
 
@@ -75,7 +75,8 @@ def _play(count: int, speed: Tensor, reaction: bool, gains: float) -> tuple[Tens
     targets = smooth_swings(worlds.nominal, count, SWING_STEPS + FOLLOW_STEPS + 1, SEED, arm=0.6, rest=0.02)
     for step in range(SWING_STEPS):
         worlds.step(targets[step])
-    _throw(worlds, speed)
+    everyone, no_spin = torch.ones(count, dtype=torch.bool), torch.zeros(count, 3)
+    worlds.serve(everyone, *throw(worlds, speed), no_spin)
     start = worlds.engine.qpos_path[:, -1].clone()
     worlds.step(targets[SWING_STEPS])
     events = worlds.ball.events
@@ -100,22 +101,6 @@ def _play(count: int, speed: Tensor, reaction: bool, gains: float) -> tuple[Tens
         worlds.step(targets[SWING_STEPS + 1 + step])
         path.append(worlds.kinematics.paddle_path[:, -1].clone())
     return torch.stack(path), worlds, struck
-
-
-def _throw(worlds: Worlds, speed: Tensor) -> None:
-    """Balls that meet the blades MEETING s later, up to 5 cm off their centres, at ``speed`` (N,) along the normal."""
-    paddle = worlds.kinematics.paddle_path[:, -1]
-    centre, normal, velocity, turning = paddle.split(3, dim=1)
-    draw = torch.rand(len(speed), 3, generator=torch.Generator().manual_seed(SEED)) - 0.5
-    across = draw - (draw * normal).sum(1, keepdim=True) * normal
-    offset = 0.05 * across / across.norm(dim=1, keepdim=True) * draw[:, :1].abs() * 2
-    at_once = velocity + torch.linalg.cross(turning, offset)
-    approach = at_once - speed.unsqueeze(1) * normal
-    touching = worlds.config.ball.radius + worlds.config.ball.table.paddle_half_thickness
-    meeting = centre + offset + touching * normal + MEETING * at_once
-    worlds.serve(
-        torch.ones(len(speed), dtype=torch.bool), meeting - MEETING * approach, approach, torch.zeros_like(draw)
-    )
 
 
 def _out_of_the_way(count: int) -> tuple[Tensor, Tensor, Tensor]:
