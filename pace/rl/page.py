@@ -181,7 +181,7 @@ class Page:
 
     def _build_controls(self, balls: Sequence[str], speed: float) -> None:
         gui = self.server.gui
-        gui.configure_theme(show_logo=False, show_share_button=False)
+        gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
         gui.main_panel.dock_right()
         self._score = gui.add_markdown(self.show.score.text())
         next_serve = gui.add_button("Next serve")
@@ -229,8 +229,7 @@ class Page:
         return tuple(folder.name for folder in reversed(checkpoints_of(self._policy)))
 
     def _change_ball(self, name: str) -> None:
-        self._ball = name
-        self._restart(self._policy)
+        self._restart(self._policy, name)
 
     def _change_checkpoint(self, name: str) -> None:
         if name == Path(self._policy.source).name:
@@ -240,17 +239,17 @@ class Page:
         except CheckpointError as error:  # the training run may have deleted it
             self._status.content = f"**{error}**"
             return
-        self._restart(policy)
+        self._restart(policy, self._ball)
 
-    def _restart(self, policy: TaskPolicy) -> None:
+    def _restart(self, policy: TaskPolicy, ball: str | None) -> None:
         """Another policy or another ball: a new show, with a new score."""
-        ball = [f"ball={self._ball}"] if self._ball else []
+        chosen = [f"ball={ball}"] if ball else []
         try:
-            self.show = Show(policy, [*self._overrides, *ball], self._seed)
+            self.show = Show(policy, [*self._overrides, *chosen], self._seed)
         except ConfigError as error:
             self._status.content = f"**{error}**"
             return
-        self._policy = policy
+        self._policy, self._ball = policy, ball
         self.show.choose(self.serve)
         self._drawn_flight = 0
         self._status.content = self._describe()

@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 SHOW_OVERRIDES = ("serve=mixed", "reset=evaluation", "engine.threads=1")
 FLIGHT_DT = 0.01  # s between the points of a flight line
 FLIGHT_POINTS = 200
-FLIGHT_COLOUR = (0.95, 0.95, 1.0, 1.0)
+FLIGHT_COLOUR = (0.95, 0.35, 0.1, 1.0)
 APEX_COLOUR, PREDICTION_COLOUR, BASE_COLOUR = (0.1, 0.8, 0.25, 1.0), (1.0, 0.9, 0.1, 1.0), (0.15, 0.4, 1.0, 1.0)
 APEX_RADIUS, PREDICTION_RADIUS, BASE_RADIUS = 0.024, 0.03, 0.05  # m
 FLIGHT_WIDTH = 2.0  # pixels

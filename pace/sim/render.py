@@ -116,6 +116,7 @@ class SceneRenderer:
         """A new picture from a camera of the model, or a free one, with ``marks`` in it."""
         view = camera if isinstance(camera, mujoco.MjvCamera) else self._fixed(camera)
         everything = mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateCamera(self.model, self.data, view, self._scene)  # first: the headlight is where it was last
         mujoco.mjv_updateScene(self.model, self.data, self._option, None, view, everything, self._scene)
         for mark in marks:
             self._add(mark)
