@@ -195,11 +195,14 @@ def metadata(policy: TaskPolicy, differences: Mapping[str, float], options: Expo
 
 def training_versions(policy: TaskPolicy) -> dict[str, Any] | None:
     """Versions and git commit that the run was trained with; None where the run folder does not say."""
-    file = Path(policy.source).parent.parent / VERSIONS
-    try:
-        return json.loads(file.read_text())
-    except (OSError, ValueError):
-        return None
+    checkpoint = Path(policy.source)
+    for folder in (checkpoint, checkpoint.parent.parent):  # a kept policy, or a checkpoint of a run
+        if (folder / VERSIONS).is_file():
+            try:
+                return json.loads((folder / VERSIONS).read_text())
+            except (OSError, ValueError):
+                return None
+    return None
 
 
 class RawReadings:

@@ -22,7 +22,7 @@ from pace.config import ConfigError, ExportConfig, TrainConfig, compose, load_tr
 from pace.predictor.network import PredictorNetwork
 from pace.rl import export
 from pace.rl.deployed import INPUTS, OUTPUT_NAMES, BallTracks, DeployedPolicy, PaddleChain, base_rotation, input_shapes
-from pace.rl.export import ExportError, RawReadings, compare, export_policy, open_session
+from pace.rl.export import ExportError, RawReadings, compare, export_policy, open_session, training_versions
 from pace.rl.loading import TaskPolicy, built_in_policy, load_policy, policy_size
 from pace.rl.observations import BallTrack
 from pace.rl.policy import Policy
@@ -108,6 +108,18 @@ def fresh_policy(overrides: Sequence[str]) -> TaskPolicy:
     network = Policy.build(policy_size(config), 21, config.algo)
     network.load_agent(make_agent(config).state_dict())
     return TaskPolicy(config, network.eval(), PredictorNetwork(config.predictor), "fresh")
+
+
+def test_the_commit_of_the_training_is_found(tmp_path: Path) -> None:
+    run = save_run(tmp_path / "run")
+    policy = load_policy(run)
+    assert training_versions(policy) is None
+    (run / "versions.json").write_text('{"git": {"commit": "abc"}}')
+    assert training_versions(policy) == {"git": {"commit": "abc"}}
+    (Path(policy.source) / "versions.json").write_text('{"git": {"commit": "def"}}')  # as pace.rl.keep leaves it
+    assert training_versions(policy) == {"git": {"commit": "def"}}
+    (Path(policy.source) / "versions.json").write_text("{")
+    assert training_versions(policy) is None
 
 
 class TorchSession:

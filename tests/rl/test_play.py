@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
+import sys
 import threading
 from collections.abc import Iterator
 from itertools import pairwise
@@ -15,9 +16,10 @@ import torch
 from browser import Chromium, find_chromium, wait_for
 from saved import make_config, save_run
 
-from pace.config import ConfigError, PlayConfig, compose, parse
+from pace.config import ConfigError, ExportConfig, PlayConfig, compose, parse
 from pace.rl import play
 from pace.rl.checkpoint import list_checkpoints
+from pace.rl.export import ExportError, export_policy
 from pace.rl.loading import TaskPolicy, built_in_policy, load_policy
 from pace.rl.play import video_option
 from pace.rl.show import Score, Serve, Show
@@ -172,6 +174,20 @@ def test_bad_input_is_one_line(
             assert error[0].startswith("error: ")
             assert message in error[0]
     assert not (tmp_path / "out.mp4").exists()
+
+
+def test_missing_packages_are_named(monkeypatch: pytest.MonkeyPatch, policy: TaskPolicy, tmp_path: Path) -> None:
+    from pace.rl.page import PageError, require_viewer
+
+    monkeypatch.setitem(sys.modules, "mjviser", None)
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    monkeypatch.setitem(sys.modules, "onnxscript", None)
+    with pytest.raises(PageError, match=r"mjviser.*pip install 'pace-table-tennis\[viewer\]'"):
+        require_viewer()
+    with pytest.raises(RenderError, match=r"imageio_ffmpeg.*pip install 'pace-table-tennis\[viewer\]'"):
+        write_video(tmp_path / "a.mp4", standing(), 0.1, 20, 1.0, 64, 64)
+    with pytest.raises(ExportError, match=r"onnxscript.*pip install 'pace-table-tennis\[export\]'"):
+        export_policy(policy, tmp_path / "a.onnx", parse(compose("export", ["run=any"]), ExportConfig))
 
 
 def _no_gl() -> object:
