@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
+from itertools import accumulate, pairwise
 
 import torch
 from torch import Tensor, nn
@@ -18,6 +18,18 @@ POSITION_CENTRE, POSITION_SCALE = (0.0, 0.0, 1.0), (1.0, 0.4, 0.25)
 STEP_CENTRE, STEP_SCALE = (-0.11, 0.0, 0.0), (0.02, 0.02, 0.03)
 OUTPUT_CENTRES = {"apex": (-1.5, 0.0, 1.0), "target": (-1.6, 0.0, 1.0), "target_time": (0.3,)}
 OUTPUT_SCALES = {"apex": (0.3, 0.25, 0.12), "target": (0.25, 0.25, 0.15), "target_time": (0.25,)}
+
+
+def predictor_slices(outputs: list[str]) -> dict[str, slice]:
+    """Columns of each named part of the predictor's output.
+
+    Errors: :class:`ConfigError` for an unknown name, or when the apex is not among them.
+    """
+    unknown = [name for name in outputs if name not in OUTPUT_SIZES]
+    if unknown or "apex" not in outputs:
+        raise ConfigError(f"predictor.outputs must hold apex and may hold {list(OUTPUT_SIZES)}: {outputs}")
+    ends = list(accumulate(OUTPUT_SIZES[name] for name in outputs))
+    return {name: slice(end - OUTPUT_SIZES[name], end) for name, end in zip(outputs, ends, strict=True)}
 
 
 class PredictorNetwork(nn.Module):
@@ -37,17 +49,11 @@ class PredictorNetwork(nn.Module):
 
     def __init__(self, config: PredictorConfig) -> None:
         super().__init__()
-        unknown = [name for name in config.outputs if name not in OUTPUT_SIZES]
-        if unknown or "apex" not in config.outputs:
-            raise ConfigError(f"predictor.outputs must hold apex and may hold {list(OUTPUT_SIZES)}: {config.outputs}")
+        self.slices = predictor_slices(config.outputs)
         if config.frames < 2:
             raise ConfigError(f"predictor.frames must be at least 2 to see a velocity, got {config.frames}")
         self.frames = config.frames
         self.outputs = list(config.outputs)
-        self.slices: dict[str, slice] = {}
-        for name in self.outputs:
-            start = sum(OUTPUT_SIZES[n] for n in self.slices)
-            self.slices[name] = slice(start, start + OUTPUT_SIZES[name])
         self.input_size = 3 * config.frames
         self.output_size = sum(OUTPUT_SIZES[name] for name in self.outputs)
         self._scaling("position", POSITION_CENTRE, POSITION_SCALE)

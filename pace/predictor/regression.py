@@ -10,6 +10,7 @@ from torch import Tensor
 
 from pace.config import PredictorConfig
 from pace.predictor.network import PredictorNetwork
+from pace.predictor.optimiser import load_optimiser_state, optimiser_state
 
 TIME_BINS = (0.0, 0.1, 0.2, 0.3, 0.4)  # s before the apex; the first and the last bin are open
 BIN_NAMES = ("after_apex", "0_0.1s", "0.1_0.2s", "0.2_0.3s", "0.3_0.4s", "over_0.4s")
@@ -99,12 +100,9 @@ class PredictorTrainer:
 
     def state_dict(self) -> dict[str, Any]:
         """Adam's moments and the count of updates; the network's weights are kept with the policy's."""
-        moments = {str(i): entry for i, entry in self.optimiser.state_dict()["state"].items()}
-        return {"updates": self.updates, "moments": moments}
+        return {"updates": self.updates, **optimiser_state(self.optimiser)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` gave."""
         self.updates = int(state["updates"])
-        whole = self.optimiser.state_dict()
-        whole["state"] = {int(index): entry for index, entry in state["moments"].items()}
-        self.optimiser.load_state_dict(whole)
+        load_optimiser_state(self.optimiser, state)

@@ -16,10 +16,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pace.predictor.network import predictor_slices
 from pace.predictor.regression import BIN_NAMES, TIME_BINS
 from pace.rl.env import TableTennisEnv
 from pace.rl.loading import TaskPolicy
-from pace.rl.observations import predictor_slices
 from pace.rl.task import Outcome
 
 #: Columns of a serve's record, m and m/s, world frame. NaN where there is none.

@@ -19,6 +19,7 @@ from pace.rl.checkpoint import META, TRAINING, WEIGHTS, Checkpoint, CheckpointEr
 from pace.rl.observations import JOINTS, POLICY
 from pace.rl.policy import Policy
 from pace.sim.engine import resolve_device
+from pace.sim.snapshot import under_prefix
 
 if TYPE_CHECKING:
     from pace.rl.env import TableTennisEnv
@@ -87,8 +88,8 @@ def load_policy(path: str | Path, device: str | torch.device = "cpu") -> TaskPol
     network = Policy.build(policy_size(config), JOINTS, config.algo)
     agent = _part(checkpoint, "agent")
     parts = (
-        ("normaliser", network.norm, _under("policy_norm.", agent)),
-        ("actor", network.mlp, _under("actor.mlp.", agent)),
+        ("normaliser", network.norm, under_prefix("policy_norm", agent)),
+        ("actor", network.mlp, under_prefix("actor.mlp", agent)),
         ("predictor", predictor, _part(checkpoint, "predictor")),
     )
     for name, module, weights in parts:
@@ -133,10 +134,6 @@ def _part(checkpoint: Checkpoint, name: str) -> dict[str, Tensor]:
     if not isinstance(checkpoint.weights, dict) or name not in checkpoint.weights:
         raise CheckpointError(f"{checkpoint.path}: the weights of the {name} are missing")
     return checkpoint.weights[name]
-
-
-def _under(prefix: str, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    return {name.removeprefix(prefix): value for name, value in weights.items() if name.startswith(prefix)}
 
 
 def built_in_policy(name: str, seed: int, like: TaskPolicy | None = None, device: str = "cpu") -> TaskPolicy:

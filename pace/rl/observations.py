@@ -11,7 +11,6 @@ the current one.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from itertools import accumulate
 from typing import NamedTuple, Protocol
 
 import torch
@@ -19,7 +18,7 @@ import warp as wp
 from torch import Tensor
 
 from pace.config import ConfigError, PredictorConfig
-from pace.predictor.network import OUTPUT_SIZES
+from pace.predictor.network import OUTPUT_SIZES, predictor_slices
 from pace.rl.signal_kernels import PredictionLayout, follow_ball, read_prediction
 from pace.rl.state import TaskState
 from pace.rl.task_kernels import Rules
@@ -163,18 +162,6 @@ class ActorSignals:
             self.prediction[rows] = predictor(self.track.positions[rows])
         else:
             self.prediction.copy_(predictor(self.track.positions))
-
-
-def predictor_slices(outputs: list[str]) -> dict[str, slice]:
-    """Columns of each named part of the predictor's output.
-
-    Errors: :class:`ConfigError` for an unknown name, or when the apex is not among them.
-    """
-    unknown = [name for name in outputs if name not in OUTPUT_SIZES]
-    if unknown or "apex" not in outputs:
-        raise ConfigError(f"predictor.outputs must hold apex and may hold {list(OUTPUT_SIZES)}: {outputs}")
-    ends = list(accumulate(OUTPUT_SIZES[name] for name in outputs))
-    return {name: slice(end - OUTPUT_SIZES[name], end) for name, end in zip(outputs, ends, strict=True)}
 
 
 class ActorObservation(NamedTuple):

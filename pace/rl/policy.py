@@ -207,12 +207,6 @@ class Policy(nn.Module):
         norm = RunningNorm(policy_size, config.observation_clip)
         return cls(norm, MLP(policy_size, config.actor_hidden, actions, config.last_layer_gain, torch.float32))
 
-    def load_agent(self, weights: dict[str, Tensor]) -> None:
-        """Take the actor's part of an agent's ``state_dict``."""
-        parts = (("policy_norm.", self.norm), ("actor.mlp.", self.mlp))
-        for prefix, module in parts:
-            module.load_state_dict({k.removeprefix(prefix): v for k, v in weights.items() if k.startswith(prefix)})
-
     def forward(self, observation: Tensor) -> Tensor:
         """Raw observation (N, policy_size) -> mean action (N, actions)."""
         return self.mlp(self.norm(observation))

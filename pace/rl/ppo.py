@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torchrl.objectives import ClipPPOLoss, KLAdaptiveLR
 
 from pace.config import AlgoConfig, ConfigError
+from pace.predictor.optimiser import load_optimiser_state, optimiser_state
 from pace.rl.policy import Agent, scheduled
 from pace.rl.rollout import Rollout, RolloutError
 
@@ -157,18 +158,3 @@ class PPO:
         """Restore what :meth:`state_dict` gave."""
         load_optimiser_state(self.actor_optimiser, state["actor_optimiser"])
         load_optimiser_state(self.critic_optimiser, state["critic_optimiser"])
-
-
-def optimiser_state(optimiser: torch.optim.Optimizer) -> dict[str, Any]:
-    """Adam's state with string keys only, ready for a checkpoint."""
-    state = optimiser.state_dict()
-    moments = {str(index): entry for index, entry in state["state"].items()}
-    return {"lr": state["param_groups"][0]["lr"], "moments": moments}
-
-
-def load_optimiser_state(optimiser: torch.optim.Optimizer, saved: dict[str, Any]) -> None:
-    """Inverse of :func:`optimiser_state`, for an optimiser over the same parameters."""
-    state = optimiser.state_dict()
-    state["state"] = {int(index): entry for index, entry in saved["moments"].items()}
-    state["param_groups"][0]["lr"] = saved["lr"]
-    optimiser.load_state_dict(state)

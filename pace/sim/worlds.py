@@ -15,6 +15,7 @@ from pace.sim.kinematics import Kinematics
 from pace.sim.randomization import Randomizer
 from pace.sim.robot import JOINT_NAMES, build_model, nominal_pose
 from pace.sim.sharing import record
+from pace.sim.snapshot import under_prefix, with_prefix
 
 
 @dataclass(frozen=True)
@@ -234,19 +235,17 @@ class Worlds:
         """All that the next control step depends on, besides the random generator."""
         events = {f"event.{f.name}": getattr(self.ball.events, f.name) for f in fields(self.ball.events)}
         ball = {"position": self.ball.position, "velocity": self.ball.velocity, "spin": self.ball.spin}
-        drawn = {f"drawn.{name}": value for name, value in self.randomizer.state_dict().items()}
-        engine = {f"engine.{name}": value for name, value in self.engine.state_dict().items()}
+        drawn = with_prefix("drawn", self.randomizer.state_dict())
+        engine = with_prefix("engine", self.engine.state_dict())
         return ball | events | drawn | engine | {"previous_targets": self._previous_targets}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Put back what :meth:`state_dict` returned."""
-        prefix = "drawn."
-        self.randomizer.load_state_dict({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
+        self.randomizer.load_state_dict(under_prefix("drawn", state))
         self._update_delay()
         everyone = torch.ones(self.num_worlds, dtype=torch.bool, device=self.device)
         self.engine.apply_params(everyone)
-        prefix = "engine."
-        self.engine.load_state_dict({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
+        self.engine.load_state_dict(under_prefix("engine", state))
         for name, tensor in self.state_dict().items():
             if not name.startswith(("drawn.", "engine.")):
                 tensor.copy_(state[name])

@@ -105,8 +105,9 @@ def test_the_metadata_is_what_a_robot_needs(exported: tuple[Path, dict[str, floa
 def fresh_policy(overrides: Sequence[str]) -> TaskPolicy:
     """A policy of random weights on another task."""
     config = load_train_config(["algo.actor_hidden=[8]", "algo.critic_hidden=[8]", "algo.autocast=fp32", *overrides])
-    network = Policy.build(policy_size(config), 21, config.algo)
-    network.load_agent(make_agent(config).state_dict())
+    agent, network = make_agent(config), Policy.build(policy_size(config), 21, config.algo)
+    network.norm.load_state_dict(agent.policy_norm.state_dict())
+    network.mlp.load_state_dict(agent.actor.mlp.state_dict())
     return TaskPolicy(config, network.eval(), PredictorNetwork(config.predictor), "fresh")
 
 

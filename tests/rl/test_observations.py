@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from pace.config import ConfigError, PredictorConfig, TaskConfig
+from pace.predictor.network import predictor_slices
 from pace.rl.env import TableTennisEnv
 from pace.rl.observations import (
     CRITIC,
@@ -20,7 +21,6 @@ from pace.rl.observations import (
     check_critic,
     check_policy,
     layout,
-    predictor_slices,
 )
 from pace.rl.task import rules_of
 from pace.sim.sensing import Sensing

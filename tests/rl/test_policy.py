@@ -122,5 +122,6 @@ def test_deterministic_policy_is_the_mean_action_of_the_agent() -> None:
     raw = 4.0 + 3.0 * torch.randn(64, 6)
     agent.policy_norm.update(raw)
     policy = Policy.build(6, 2, config)
-    policy.load_agent(agent.state_dict())
+    policy.norm.load_state_dict(agent.policy_norm.state_dict())
+    policy.mlp.load_state_dict(agent.actor.mlp.state_dict())
     torch.testing.assert_close(policy(raw), agent.actor.mlp(agent.policy_norm(raw)))
