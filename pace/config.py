@@ -306,7 +306,7 @@ class AlgoConfig:
     learning_rate: float
     learning_rate_min: float
     learning_rate_max: float
-    kl_target: float
+    kl_target: list[SchedulePoint]  # mean KL divergence of an update that the learning rate is adapted to
     max_grad_norm: float
     observation_clip: float
     last_layer_gain: float
@@ -317,8 +317,9 @@ class AlgoConfig:
         _require(0 < self.gamma <= 1, "algo.gamma must lie in (0, 1]")
         for name in ("steps", "epochs", "minibatches"):
             _require(getattr(self, name) >= 1, f"algo.{name} must be at least 1")
-        for name in ("entropy", "std"):
+        for name in ("entropy", "std", "kl_target"):
             _require(len(getattr(self, name)) >= 1, f"algo.{name} needs at least one point")
+        _require(all(point.value > 0 for point in self.kl_target), "algo.kl_target must be positive")
 
 
 @dataclass
@@ -374,7 +375,8 @@ class TrainConfig(TaskConfig):
 
     algo: AlgoConfig
     name: str
-    num_worlds: int
+    num_worlds: int  # in all processes together
+    processes: int  # 0: one a core with 256 worlds or more each on a CPU, one on a GPU
     device: str  # auto, cpu, cuda, cuda:1
     seed: int
     samples: float  # control steps in all; whichever of samples and minutes ends first
@@ -388,6 +390,11 @@ class TrainConfig(TaskConfig):
 
     def __post_init__(self) -> None:
         _require(self.num_worlds >= 1, f"num_worlds must be at least 1, got {self.num_worlds}")
+        _require(self.processes >= 0, f"processes must be 0 (chosen for the machine) or more, got {self.processes}")
+        _require(
+            self.processes == 0 or self.num_worlds % self.processes == 0,
+            f"num_worlds {self.num_worlds} cannot be shared equally by {self.processes} processes",
+        )
         _require(self.samples > 0, "samples must be positive")
         _require(self.minutes >= 0, f"minutes must not be negative (0: no limit), got {self.minutes}")
         _require(not (self.resume and self.init_from), "give resume or init_from, not both")

@@ -42,10 +42,10 @@ def memory_peak(config: BenchConfig, overrides: list[str]) -> dict[str, float]:
 
 
 def training_run(num_worlds: int, updates: int, overrides: list[str]) -> tuple[float, float]:
-    """Train for ``updates`` in a process of its own.
+    """Train for ``updates`` in a command of its own.
 
     Returns its control steps a second after the first updates (NaN for a run that is too short), and the largest
-    resident memory of the process in MiB. Errors: :class:`BenchError` when the command fails.
+    resident memory of its processes together in MiB. Errors: :class:`BenchError` when the command fails.
     """
     kept = without(overrides, "num_worlds", "samples", "minutes", "run_dir", "progress", "tensorboard")
     steps = load_train_config(kept).algo.steps
@@ -68,12 +68,21 @@ def _peak_mib(command: list[str], output: Path) -> float:
     with output.open("w") as file:
         process = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT)
         while process.poll() is None:
-            peak = max(peak, _resident_peak_mib(process.pid))
+            peak = max(peak, sum(_resident_peak_mib(pid) for pid in _family(process.pid)))
             time.sleep(POLL_SECONDS)
     if process.returncode != 0:
         tail = "\n".join(output.read_text().splitlines()[-15:])
         raise BenchError(f"{' '.join(command)} ended with status {process.returncode}:\n{tail}")
     return peak
+
+
+def _family(pid: int) -> list[int]:
+    """A process and those that it started, such as the helpers of a training run."""
+    try:
+        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    except FileNotFoundError:  # it has just ended, or there is no /proc, of which the caller is told
+        children = []
+    return [pid, *(descendant for child in children for descendant in _family(int(child)))]
 
 
 def _resident_peak_mib(pid: int) -> float:

@@ -11,6 +11,7 @@ from torch import Tensor
 from pace.config import PredictorConfig
 from pace.predictor.network import PredictorNetwork
 from pace.predictor.optimiser import load_optimiser_state, optimiser_state
+from pace.team import Team
 
 TIME_BINS = (0.0, 0.1, 0.2, 0.3, 0.4)  # s before the apex; the first and the last bin are open
 BIN_NAMES = ("after_apex", "0_0.1s", "0.1_0.2s", "0.2_0.3s", "0.3_0.4s", "over_0.4s")
@@ -28,12 +29,20 @@ class PredictorSource(Protocol):
 class PredictorTrainer:
     """Adam on a :class:`PredictorNetwork`, which it changes in place, over samples of the last (steps, N) rollout.
 
-    After ``config.train_updates`` updates the network is frozen (0: never); errors are measured all the same.
+    After ``config.train_updates`` updates the network is frozen (0: never); errors are measured all the same. The
+    processes of a ``team`` share the samples of a batch.
     """
 
-    def __init__(self, network: PredictorNetwork, config: PredictorConfig, steps: int, num_worlds: int) -> None:
+    def __init__(
+        self,
+        network: PredictorNetwork,
+        config: PredictorConfig,
+        steps: int,
+        num_worlds: int,
+        team: Team | None = None,
+    ) -> None:
         device = next(network.parameters()).device
-        self.network, self.config, self.steps = network, config, steps
+        self.network, self.config, self.steps, self.team = network, config, steps, team or Team()
         self.updates = 0
         self.optimiser = torch.optim.Adam(network.parameters(), lr=config.learning_rate)
         self.inputs = torch.zeros(steps, num_worlds, network.input_size, device=device)
@@ -80,6 +89,7 @@ class PredictorTrainer:
         sums = torch.zeros(2, len(BIN_NAMES), device=squared.device)
         sums[0].index_add_(0, bins, squared * weight)
         sums[1].index_add_(0, bins, weight)
+        self.team.sum_(sums)
         totals = torch.cat([sums.sum(1, keepdim=True), sums], dim=1)
         return dict(zip(names, (100.0 * (totals[0] / totals[1]).sqrt()).tolist(), strict=True))
 
@@ -89,13 +99,15 @@ class PredictorTrainer:
         valid = self.valid.flatten()
         by_validity = torch.argsort(valid, descending=True, stable=True)
         count = valid.sum()
+        rows = max(1, self.config.batch_size // self.team.size)
         for _ in range(self.config.batches_per_update):
-            draw = torch.rand(self.config.batch_size, device=valid.device)
+            draw = torch.rand(rows, device=valid.device)
             index = by_validity[(draw * count).long()]
             error = self.network.scaled(inputs[index]) - self.network.scale_target(targets[index])
             loss = (error.square().mean(1) * valid[index]).mean()  # zero where the rollout had no valid sample at all
             self.optimiser.zero_grad(set_to_none=True)
             loss.backward()
+            self.team.mean_([p.grad for p in self.network.parameters() if p.grad is not None])
             self.optimiser.step()
 
     def state_dict(self) -> dict[str, Any]:

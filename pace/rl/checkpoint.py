@@ -193,7 +193,7 @@ def prune_checkpoints(run_dir: Path, keep: int) -> None:
 
 
 #: Keys that say where and how a run was made, not what it learned: a kept policy has their defaults.
-RUN_KEYS: dict[str, Any] = {"device": "auto", "run_dir": None, "resume": None, "init_from": None}
+RUN_KEYS: dict[str, Any] = {"device": "auto", "processes": 0, "run_dir": None, "resume": None, "init_from": None}
 
 
 def export_weights(path: str | Path, folder: str | Path) -> Path:

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torchrl.modules import IndependentNormal
 
 from pace.config import AlgoConfig, ConfigError, SchedulePoint
+from pace.team import Team
 
 SMALLEST_STD = 1e-4  # the scale module's own lower bound
 VARIANCE_FLOOR = 1e-4  # observations that hardly vary are not blown up: the divisor is at least 0.01
@@ -86,6 +87,29 @@ class RunningNorm(nn.Module):
         self.var.copy_(torch.where(finite, spread, self.var))
         self.count.copy_(torch.where(finite, total, self.count))
         self.finite.logical_and_(finite)
+        self._refresh()
+
+    def moments(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Copies of count (), mean (size,) and variance (size,), for :meth:`pool`."""
+        return self.count.clone(), self.mean.clone(), self.var.clone()
+
+    @torch.no_grad()
+    def pool(self, before: tuple[Tensor, Tensor, Tensor], team: Team) -> None:
+        """Make one set of moments of what each process of ``team`` has merged since all had the moments ``before``.
+
+        In powers about the old mean, what a process saw is a plain difference of sums, and those add up.
+        """
+        if team.size == 1:
+            return
+        count, mean, var = before
+        shift = self.mean - mean
+        first = self.count * shift
+        second = self.count * (self.var + shift.square()) - count * var
+        seen = team.sum_(torch.cat(((self.count - count).view(1), first, second)))
+        self.count.copy_(count + seen[0])
+        shift = seen[1 : self.size + 1] / self.count
+        self.mean.copy_(mean + shift)
+        self.var.copy_((count * var + seen[self.size + 1 :]) / self.count - shift.square())
         self._refresh()
 
     def _refresh(self) -> None:

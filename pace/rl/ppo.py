@@ -14,6 +14,7 @@ from pace.config import AlgoConfig, ConfigError
 from pace.predictor.optimiser import load_optimiser_state, optimiser_state
 from pace.rl.policy import Agent, scheduled
 from pace.rl.rollout import Rollout, RolloutError
+from pace.team import Team
 
 LOSS_METRICS = (
     "loss_objective",
@@ -45,10 +46,13 @@ class PPOLoss(ClipPPOLoss):
 
 
 class PPO:
-    """Learner of an :class:`Agent`: one optimiser, gradient bound and parameter set each for actor and critic."""
+    """Learner of an :class:`Agent`: one optimiser, gradient bound and parameter set each for actor and critic.
 
-    def __init__(self, agent: Agent, config: AlgoConfig) -> None:
-        self.agent, self.config = agent, config
+    The processes of a ``team`` learn from the union of their rollouts: gradients, KL and metrics are means over them.
+    """
+
+    def __init__(self, agent: Agent, config: AlgoConfig, team: Team | None = None) -> None:
+        self.agent, self.config, self.team = agent, config, team or Team()
         self.loss = PPOLoss(
             agent.actor_operator(),
             agent.critic_operator(),
@@ -65,7 +69,7 @@ class PPO:
         self.critic_optimiser = torch.optim.Adam(self.critic_parameters, lr=config.learning_rate, fused=True)
         self.schedule = KLAdaptiveLR(
             self.actor_optimiser,
-            config.kl_target,
+            config.kl_target[0].value,
             min_lr=config.learning_rate_min,
             max_lr=config.learning_rate_max,
         )
@@ -77,6 +81,7 @@ class PPO:
         Errors: :class:`RolloutError` when a loss is not finite; the weights are then not to be saved.
         """
         self.loss.get_buffer("entropy_coeff").fill_(scheduled(self.config.entropy, samples))
+        self.schedule.target_kl = scheduled(self.config.kl_target, samples)
         sources, batch = self._sources(rollout), self._buffers(rollout)
         rows = batch.batch_size[0]
         totals: list[Tensor] = []
@@ -87,8 +92,9 @@ class PPO:
                     torch.index_select(source, 0, index, out=batch[name])
                 totals.append(self._learn(batch))
         self.agent.actor.bound_std(self.config.std_floor, scheduled(self.config.std, samples))
-        mean = torch.stack(totals).mean(0).tolist()
-        metrics: dict[str, float] = dict(zip(METRICS, mean, strict=True))
+        mean = torch.stack(totals).mean(0)
+        self.team.mean_([mean])
+        metrics: dict[str, float] = dict(zip(METRICS, mean.tolist(), strict=True))
         self._require_finite(metrics)
         metrics["lr"] = self.schedule.get_last_lr()[0]
         metrics["policy_std"] = self.agent.actor.std.mean().item()
@@ -99,14 +105,19 @@ class PPO:
         self.actor_optimiser.zero_grad(set_to_none=True)
         self.critic_optimiser.zero_grad(set_to_none=True)
         out = self.loss(batch)
+        (out["loss_objective"] + out["loss_entropy"]).backward()
+        receive_actors = self.team.mean_later([self.loss.kl, *gradients(self.actor_parameters)])
+        out["loss_critic"].backward()  # while the actor's gradients travel; the critic's do while the actor learns
+        receive_critics = self.team.mean_later(gradients(self.critic_parameters))
+        receive_actors()
         kl = self.loss.kl.item()
         if not math.isfinite(kl):
             raise RolloutError("not finite: the policy's output in the PPO update (its KL divergence)")
         self.schedule.step(kl)
-        (out["loss_objective"] + out["loss_critic"] + out["loss_entropy"]).backward()
         actor_norm = nn.utils.clip_grad_norm_(self.actor_parameters, self.config.max_grad_norm)
-        critic_norm = nn.utils.clip_grad_norm_(self.critic_parameters, self.config.max_grad_norm)
         self.actor_optimiser.step()
+        receive_critics()
+        critic_norm = nn.utils.clip_grad_norm_(self.critic_parameters, self.config.max_grad_norm)
         self.critic_optimiser.step()
         values = [out.get(name, torch.zeros(())) for name in LOSS_METRICS]
         return torch.stack([v.detach().reshape(()) for v in (self.loss.kl, actor_norm, critic_norm, *values)])
@@ -115,14 +126,17 @@ class PPO:
         """Flat (steps * N, ...) views of the rollout by the loss's names; advantages standardised over all samples."""
         steps = rollout.steps
         advantage = rollout.advantage.view(-1, 1)
-        deviation, mean = torch.std_mean(advantage)
+        mean = advantage.mean()
+        self.team.mean_([mean])
+        variance = (advantage - mean).square().mean()
+        self.team.mean_([variance])
         return {
             "policy": rollout.policy.flatten(0, 1),
             "critic": rollout.critic[:steps].flatten(0, 1),
             "action": rollout.action.flatten(0, 1),
             "old_loc": rollout.loc.flatten(0, 1),
             "action_log_prob": rollout.log_prob.view(-1),
-            "advantage": (advantage - mean) / (deviation + 1e-8),
+            "advantage": (advantage - mean) / (variance.sqrt() + 1e-8),
             "value_target": rollout.value_target.view(-1, 1),
             "state_value": rollout.value[:steps].view(-1, 1),
         }
@@ -158,3 +172,8 @@ class PPO:
         """Restore what :meth:`state_dict` gave."""
         load_optimiser_state(self.actor_optimiser, state["actor_optimiser"])
         load_optimiser_state(self.critic_optimiser, state["critic_optimiser"])
+
+
+def gradients(parameters: list[nn.Parameter]) -> list[Tensor]:
+    """The gradients of those parameters that have one."""
+    return [parameter.grad for parameter in parameters if parameter.grad is not None]

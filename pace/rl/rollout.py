@@ -47,7 +47,7 @@ class Rollout:
     """``steps`` control steps of N worlds: (steps, N, ...) tensors, and what GAE makes of them.
 
     A world may be truncated at most once in a rollout (rollouts are shorter than episodes), so one (N, Dc) buffer holds
-    all terminal critic observations and no step waits for the host. :meth:`check` reports a world that breaks this.
+    all terminal critic observations and no step waits for the host. :meth:`fault` reports a world that breaks this.
     """
 
     def __init__(self, env: VectorTask, agent: Agent, steps: int) -> None:
@@ -125,19 +125,18 @@ class Rollout:
         self.advantage.copy_(advantage)
         self.value_target.copy_(target)
 
-    def check(self) -> None:
-        """The one host sync of an update. Errors: :class:`RolloutError` for NaN, or two truncations of one world."""
+    def fault(self) -> str | None:
+        """What training cannot go on with: a value that is not finite, two truncations of one world. One host sync."""
         agent = self.agent
         finite = agent.policy_norm.finite & agent.critic_norm.finite
         finite = finite & torch.isfinite(self.reward).all() & torch.isfinite(self.value).all()
         twice = (self.truncated.sum(0) > 1).any()
         finite_host, twice_host = torch.stack([finite, twice]).tolist()
         if not finite_host:
-            raise RolloutError(self._describe_fault())
+            return self._describe_fault()
         if twice_host:
-            raise RolloutError(
-                f"a world was truncated twice within {self.steps} steps: algo.steps must be shorter than an episode"
-            )
+            return f"a world was truncated twice within {self.steps} steps: algo.steps must be shorter than an episode"
+        return None
 
     def _describe_fault(self) -> str:
         """Where the first value that is not finite stands; only called when there is one."""

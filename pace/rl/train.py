@@ -4,6 +4,7 @@ Examples::
 
     python -m pace.rl.train                                  # the recipe for CPU cores, half an hour
     python -m pace.rl.train experiment=paper device=cuda     # the paper's numbers
+    torchrun --nproc-per-node=8 -m pace.rl.train device=cuda num_worlds=32768    # eight GPUs, or several machines
     python -m pace.rl.train resume=runs/2026-01-01_pace minutes=60
     python -m pace.rl.train init_from=runs/2026-01-01_pace ball=paper
 """
@@ -11,6 +12,7 @@ Examples::
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -26,6 +28,7 @@ from pace.rl.rollout import RolloutError
 from pace.rl.run_folder import CURVE, METRICS, RunFolder, default_run_dir
 from pace.rl.trainer import Summary, Trainer
 from pace.sim.engine import resolve_device
+from pace.team import Team, TeamError, own_device, suitable_size, team_of, threads_of
 
 # What a resumed run may change; everything else is as it was saved, or the run would not go on where it stopped.
 RESUME_KEYS = ("resume", "samples", "minutes", "checkpoint_minutes", "tensorboard", "progress", "device")
@@ -33,7 +36,7 @@ RESUME_KEYS = ("resume", "samples", "minutes", "checkpoint_minutes", "tensorboar
 
 def main() -> int:
     """Entry point; returns the exit status."""
-    return run_command(train_from_config, "train", (CheckpointError, RolloutError))
+    return run_command(train_from_config, "train", (CheckpointError, RolloutError, TeamError))
 
 
 def train_from_config(composed: DictConfig) -> None:
@@ -46,13 +49,15 @@ def train_from_config(composed: DictConfig) -> None:
         print(f"going on from {saved.path}")
     else:
         saved = None
-    trainer = build_trainer(config, saved)
-    print(
-        f"training {config.name}: {config.num_worlds} worlds on {trainer.device}, "
-        f"networks in {str(trainer.agent.observation_dtype).removeprefix('torch.')}, run folder {trainer.run.path}",
-        flush=True,
-    )
-    report(trainer.train(), trainer.run.path)
+    device = own_device(resolve_device(config.device))
+    config.processes = config.processes or suitable_size(config.num_worlds, device)
+    with team_of(config.processes, device) as team:
+        trainer = build_trainer(config, saved, device, team)
+        if trainer.run is not None:
+            announce(trainer, trainer.run)
+        summary = trainer.train()
+    if summary is not None:
+        report(summary)
 
 
 def resumed_config(saved: Checkpoint, path: str, overrides: list[str]) -> TrainConfig:
@@ -74,19 +79,24 @@ def resumed_config(saved: Checkpoint, path: str, overrides: list[str]) -> TrainC
     return config
 
 
-def build_trainer(config: TrainConfig, saved: Checkpoint | None) -> Trainer:
-    """Environment, networks and run folder of ``config``; state from ``saved`` or ``config.init_from`` if given."""
+def build_trainer(config: TrainConfig, saved: Checkpoint | None, device: torch.device, team: Team) -> Trainer:
+    """Networks, this process's worlds and the leader's run folder; state from ``saved`` or ``config.init_from``.
+
+    Errors: :class:`ConfigError` for worlds that the team cannot share equally.
+    """
     from pace.rl.env import TableTennisEnv
 
-    device = resolve_device(config.device)
+    if config.num_worlds % team.size:
+        raise ConfigError(f"num_worlds {config.num_worlds} cannot be shared equally by {team.size} processes")
     start = load_checkpoint(config.init_from, weights_only=True) if config.init_from else None
     torch.manual_seed(config.seed)
     predictor = PredictorNetwork(config.predictor).to(device)
-    env = TableTennisEnv(config, config.num_worlds, device, config.seed, predictor)
-    config.run_dir = config.run_dir or str(default_run_dir(config.name))
-    first_update = int(saved.counters["updates"]) if saved else 0
-    run = RunFolder(Path(config.run_dir), to_dict(config), config.tensorboard, first_update)
-    trainer = Trainer(config, env, predictor, run)
+    threads = config.engine.threads or threads_of(team.size)
+    task = replace(config, engine=replace(config.engine, threads=threads))
+    env = TableTennisEnv(task, config.num_worlds // team.size, device, team.seed(config.seed), predictor)
+    run = open_run(config, int(saved.counters["updates"]) if saved else 0) if team.leads else None
+    trainer = Trainer(config, env, predictor, run, team)
+    torch.manual_seed(team.seed(config.seed))  # the networks began alike, what is played does not
     if saved:
         trainer.resume(saved)
     elif start:
@@ -94,8 +104,26 @@ def build_trainer(config: TrainConfig, saved: Checkpoint | None) -> Trainer:
     return trainer
 
 
-def report(summary: Summary, run_dir: Path) -> None:
+def open_run(config: TrainConfig, first_update: int) -> RunFolder:
+    """The run folder that ``config`` names, or a new one, whose path ``config`` then holds."""
+    config.run_dir = config.run_dir or str(default_run_dir(config.name))
+    return RunFolder(Path(config.run_dir), to_dict(config), config.tensorboard, first_update)
+
+
+def announce(trainer: Trainer, run: RunFolder) -> None:
+    """Print what is about to be trained, on what, and where it is kept."""
+    shared = f" in {trainer.team.size} processes" if trainer.team.size > 1 else ""
+    number_format = str(trainer.agent.observation_dtype).removeprefix("torch.")
+    print(
+        f"training {trainer.config.name}: {trainer.config.num_worlds} worlds on {trainer.device}{shared}, "
+        f"networks in {number_format}, run folder {run.path}",
+        flush=True,
+    )
+
+
+def report(summary: Summary) -> None:
     """Print how the run ended and which files it wrote."""
+    run_dir = summary.checkpoint.parent.parent
     print(
         f"{summary.reason}: {summary.updates} updates, {summary.samples:,} samples, {summary.seconds / 60:.1f} min\n"
         f"last updates: {', '.join(rate_texts(summary.rates))}\n"

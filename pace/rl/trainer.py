@@ -32,6 +32,7 @@ from pace.rl.ppo import PPO
 from pace.rl.progress import Progress
 from pace.rl.rollout import Rollout, RolloutError, VectorTask
 from pace.rl.run_folder import RunFolder, plot_learning_curve
+from pace.team import Team
 
 CHECKPOINTS_KEPT = 4
 LAST_GOOD = "last_good"  # folder in the run: the weights before an update that failed
@@ -102,24 +103,37 @@ class StopRequest:
 class Trainer:
     """Trains the policy, the critic and the predictor of ``config`` on ``env`` and keeps the run's files.
 
-    ``predictor`` is the network that ``env`` predicts with; it is trained in place.
+    ``predictor`` is the network that ``env`` predicts with; it is trained in place. ``env`` holds this process's
+    worlds; the processes of a ``team`` each have a trainer, go through every method together, and the leader has the
+    ``run``.
     """
 
-    def __init__(self, config: TrainConfig, env: TrainableTask, predictor: PredictorNetwork, run: RunFolder) -> None:
+    def __init__(
+        self,
+        config: TrainConfig,
+        env: TrainableTask,
+        predictor: PredictorNetwork,
+        run: RunFolder | None,
+        team: Team | None = None,
+    ) -> None:
         self.config, self.env, self.predictor, self.run = config, env, predictor, run
+        self.team = team = team or Team()
         self.device = env.policy_observation.device
         self.num_worlds, policy_size = env.policy_observation.shape
         critic_size = env.critic_observation.shape[1]
         self.agent = Agent(policy_size, critic_size, env.action_spec.shape[-1], config.algo, self.device)
-        self.ppo = PPO(self.agent, config.algo)
+        team.follow_([tensor for _, module in self._networks() for tensor in module.state_dict().values()])
+        self.ppo = PPO(self.agent, config.algo, team)
         self.rollout = Rollout(env, self.agent, config.algo.steps)
-        self.regression = PredictorTrainer(predictor, config.predictor, config.algo.steps, self.num_worlds)
+        self.regression = PredictorTrainer(predictor, config.predictor, config.algo.steps, self.num_worlds, team)
         self.updates, self.samples, self.wall_s = 0, 0, 0.0
         self._stop = StopRequest()
         self._saved_at = time.monotonic()
 
-    def train(self) -> Summary:
+    def train(self) -> Summary | None:
         """Run until ``samples``, ``minutes`` or a signal; writes checkpoints, metrics and the learning curve.
+
+        Returns what the leader of the team reports, and None in its other processes.
 
         Errors: :class:`RolloutError` for values that are not finite; the weights before that update are then saved in
         ``last_good/`` (for ``init_from``), and the last checkpoint stays the newest (for ``resume``).
@@ -127,7 +141,8 @@ class Trainer:
         config = self.config
         if self.samples >= config.samples:
             raise ConfigError(f"the run has {self.samples} samples and samples={config.samples:g}: nothing left to do")
-        progress = Progress(config.progress, config.samples, 60.0 * config.minutes, self.samples)
+        shown = config.progress and self.team.leads
+        progress = Progress(shown, config.samples, 60.0 * config.minutes, self.samples)
         started = last = time.monotonic()
         wall_before, reason = self.wall_s, None
         try:
@@ -138,15 +153,19 @@ class Trainer:
                     self.wall_s = wall_before + now - started
                     row |= {"wall_s": self.wall_s, "samples_per_s": self._samples_per_update / (now - last)}
                     last = now
-                    self.run.log(row)
                     progress.show(row)
-                    reason = self._reason_to_end(now - started)
-                    self._save_when_due(final=reason is not None)
+                    if self.run is not None:
+                        self.run.log(row)
+                    reason, due = self.team.decided((self._reason_to_end(now - started), self._save_is_due()))
+                    if due or reason is not None:
+                        self.save()
         finally:
             progress.close()
-            self.run.close()
-            curve = plot_learning_curve(self.run.path)
-        newest = list_checkpoints(self.run.path)[-1]
+            if self.run is not None:
+                self.run.close()
+        if self.run is None:
+            return None
+        newest, curve = list_checkpoints(self.run.path)[-1], plot_learning_curve(self.run.path)
         return Summary(reason, self.updates, self.samples, self.wall_s, newest, curve, progress.rates())
 
     def _safe_update(self) -> dict[str, float]:
@@ -155,6 +174,8 @@ class Trainer:
         try:
             return self.update()
         except RolloutError as error:
+            if self.run is None:
+                raise
             checkpoint = Checkpoint(to_dict(self.config), self._counters(), good, None)
             folder = save_checkpoint(self.run.path / LAST_GOOD, checkpoint)
             raise RolloutError(f"{error}; the weights before this update are in {folder}") from error
@@ -167,22 +188,32 @@ class Trainer:
 
     @property
     def _samples_per_update(self) -> int:
-        return self.num_worlds * self.config.algo.steps
+        return self.team.size * self.num_worlds * self.config.algo.steps
 
     def update(self) -> dict[str, float]:
         """One rollout and what is learned from it; returns the row of metrics, without the times."""
+        norms = (self.agent.policy_norm, self.agent.critic_norm)
+        before = [norm.moments() for norm in norms]
         self.rollout.begin()
         for t in range(self.rollout.steps):
             self.regression.record(t, self.env)
             self.rollout.step(t)
         self.rollout.finish(self.config.algo.gamma, self.config.algo.gae_lambda)
-        self.rollout.check()
+        self._require_no_fault()
+        for norm, moments in zip(norms, before, strict=True):
+            norm.pool(moments, self.team)
         prediction = self.regression.update()
         learning = self.ppo.update(self.rollout, self.samples)
         self.samples += self._samples_per_update
         self.updates += 1
-        task = summarise(self.env.pop_statistics(), self.config.robot.control_dt)
+        task = summarise(self.env.pop_statistics(), self.config.robot.control_dt, self.team)
         return {"update": self.updates, "samples": self.samples, **task, **prediction, **learning}
+
+    def _require_no_fault(self) -> None:
+        """Errors: :class:`RolloutError`, in every process, when the rollout of one of them cannot be learned from."""
+        faults = [fault for fault in self.team.gather(self.rollout.fault()) if fault is not None]
+        if faults:
+            raise RolloutError(faults[0])
 
     def _reason_to_end(self, seconds: float) -> str | None:
         if self._stop.name is not None:
@@ -193,24 +224,22 @@ class Trainer:
             return f"minutes={self.config.minutes:g} reached"
         return None
 
-    def _save_when_due(self, final: bool) -> None:
-        due = time.monotonic() - self._saved_at >= 60.0 * self.config.checkpoint_minutes
-        if final or due:
-            self.save()
+    def _save_is_due(self) -> bool:
+        return time.monotonic() - self._saved_at >= 60.0 * self.config.checkpoint_minutes
 
-    def save(self) -> Path:
-        """Write a checkpoint of this moment and drop old ones; returns its folder."""
-        folder = self.run.path / FOLDER / f"update_{self.updates:08d}"
-        save_checkpoint(folder, self.checkpoint())
-        prune_checkpoints(self.run.path, CHECKPOINTS_KEPT)
+    def save(self) -> None:
+        """Write a checkpoint of this moment and drop old ones."""
+        checkpoint = self.checkpoint()
+        if self.run is not None:
+            save_checkpoint(self.run.path / FOLDER / f"update_{self.updates:08d}", checkpoint)
+            prune_checkpoints(self.run.path, CHECKPOINTS_KEPT)
         self._saved_at = time.monotonic()
-        return folder
 
     def checkpoint(self) -> Checkpoint:
-        """Everything that the next update depends on."""
-        random_state = {"cpu": torch.get_rng_state()}
+        """Everything that the next update depends on, of all processes of the team."""
+        own = {"random": torch.get_rng_state(), "env": self.env.state_dict()}
         if self.device.type == "cuda":
-            random_state["cuda"] = torch.cuda.get_rng_state(self.device)
+            own["random_cuda"] = torch.cuda.get_rng_state(self.device)
         return Checkpoint(
             config=to_dict(self.config),
             counters=self._counters(),
@@ -218,8 +247,7 @@ class Trainer:
             training={
                 "ppo": self.ppo.state_dict(),
                 "regression": self.regression.state_dict(),
-                "random": random_state,
-                "env": self.env.state_dict(),
+                "processes": self.team.gather(own),
             },
         )
 
@@ -244,26 +272,33 @@ class Trainer:
         if state is None:
             raise CheckpointError(f"{checkpoint.path} holds weights only: use init_from instead of resume")
         self.load_weights(checkpoint)
+        if len(state.get("processes", ())) != self.team.size:
+            raise CheckpointError(
+                f"{checkpoint.path} was written by {len(state.get('processes', ()))} processes, "
+                f"and {self.team.size} cannot go on from it: start as many, or use init_from instead of resume"
+            )
         try:
             self.ppo.load_state_dict(state["ppo"])
             self.regression.load_state_dict(state["regression"])
-            self.env.load_state_dict(state["env"])
-            torch.set_rng_state(state["random"]["cpu"])
-            if self.device.type == "cuda" and "cuda" in state["random"]:
-                torch.cuda.set_rng_state(state["random"]["cuda"], self.device)
+            own = state["processes"][self.team.rank]
+            self.env.load_state_dict(own["env"])
+            torch.set_rng_state(own["random"])
+            if self.device.type == "cuda" and "random_cuda" in own:
+                torch.cuda.set_rng_state(own["random_cuda"], self.device)
         except (KeyError, ValueError, RuntimeError) as error:
             raise CheckpointError(f"{checkpoint.path} does not fit this configuration: {error}") from error
         self.updates, self.samples = int(checkpoint.counters["updates"]), int(checkpoint.counters["samples"])
         self.wall_s = float(checkpoint.counters["wall_s"])
 
 
-def summarise(statistics: dict[str, Tensor], control_dt: float) -> dict[str, float]:
-    """Rates of the last rollout from the environment's sums; NaN where nothing was counted.
+def summarise(statistics: dict[str, Tensor], control_dt: float, team: Team | None = None) -> dict[str, float]:
+    """Rates of the last rollout from the environments' sums over the ``team``; NaN where nothing was counted.
 
     ``hit_rate`` and ``success_rate`` are shares of the serves that ended, ``fall_rate`` is falls per second of a
     world's time, rewards are means per control step, and every other sum is given per serve.
     """
-    sums = dict(zip(statistics, torch.stack([v.float() for v in statistics.values()]).tolist(), strict=True))
+    total = (team or Team()).sum_(torch.stack([value.float() for value in statistics.values()]))
+    sums = dict(zip(statistics, total.tolist(), strict=True))
 
     def share(name: str, of: str) -> float:
         return sums[name] / sums[of] if sums[of] > 0 else math.nan

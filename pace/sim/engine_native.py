@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import os
 
 import mujoco
 import numpy as np
@@ -13,6 +12,7 @@ from torch import Tensor
 
 from pace.config import ConfigError, EngineConfig
 from pace.sim.engine import ModelFields, StateTensors
+from pace.team import usable_cores
 
 _CONTROL = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
 
@@ -32,7 +32,7 @@ class NativeEngine(StateTensors):
         model = copy.copy(model)
         # a state that is not finite stays so and is seen; MuJoCo would put that robot back on its feet without a word
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-        self._batch = batch = Batch(model, num_worlds, engine.threads or _usable_cores())
+        self._batch = batch = Batch(model, num_worlds, engine.threads or usable_cores())
         self._fields = ModelFields(model, device)
         self._model = {name: batch.expand(name) for name in ModelFields.NAMES}
         self._qpos, self._qvel = batch.bind("qpos"), batch.bind("qvel")
@@ -87,10 +87,3 @@ class NativeEngine(StateTensors):
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         for name, tensor in self.state_dict().items():
             tensor.copy_(state[name])
-
-
-def _usable_cores() -> int:
-    """Cores that this process may use: a job's share of a machine where the system tells, or all of them."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1

@@ -86,7 +86,7 @@ def test_updates_change_every_parameter_and_lower_the_critic_loss(autocast: str)
 
 
 def test_learning_rate_falls_when_the_policy_moves_too_far() -> None:
-    config = small_algo(kl_target=1e-7, epochs=4)
+    config = small_algo(kl_target=[SchedulePoint(0, 1e-7)], epochs=4)
     agent, rollout = played(config)
     ppo = PPO(agent, config)
     for _ in range(3):

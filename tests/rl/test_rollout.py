@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import pytest
+import re
+
 import torch
 from dummy import DummyTask
 from test_policy import CPU, small_algo
 from torch import Tensor
 
 from pace.rl.policy import Agent
-from pace.rl.rollout import Rollout, RolloutError
+from pace.rl.rollout import Rollout
 
 STEPS = 6
 
@@ -103,19 +104,16 @@ def test_a_nan_is_reported_with_its_world_and_term() -> None:
     env = DummyTask(8)
     env.poison_step = 3
     _, rollout = play(env)
-    with pytest.raises(RolloutError, match=r"policy column 1 of world 3 at step 3.*term position of world 3"):
-        rollout.check()
+    assert re.search(r"policy column 1 of world 3 at step 3.*term position of world 3", rollout.fault() or "")
 
 
 def test_a_reward_that_is_not_finite_is_reported() -> None:
     _, rollout = play(DummyTask(8))
-    rollout.check()
+    assert rollout.fault() is None
     rollout.reward[4, 6] = float("inf")
-    with pytest.raises(RolloutError, match="reward of world 6 at step 4"):
-        rollout.check()
+    assert "reward of world 6 at step 4" in (rollout.fault() or "")
 
 
 def test_two_truncations_within_a_rollout_are_refused() -> None:
     _, rollout = play(DummyTask(8, length=2))
-    with pytest.raises(RolloutError, match=r"algo\.steps must be shorter than an episode"):
-        rollout.check()
+    assert "algo.steps must be shorter than an episode" in (rollout.fault() or "")

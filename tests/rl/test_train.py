@@ -14,7 +14,13 @@ from pace.rl.train import main
 
 WORLDS = 8
 UPDATE = WORLDS * 12
-SMALL = ("algo.actor_hidden=[32]", "algo.critic_hidden=[32]", "predictor.batches_per_update=2", "progress=false")
+SMALL = (
+    "algo.steps=12",
+    "algo.actor_hidden=[32]",
+    "algo.critic_hidden=[32]",
+    "predictor.batches_per_update=2",
+    "progress=false",
+)
 
 
 @pytest.fixture

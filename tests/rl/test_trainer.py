@@ -28,6 +28,7 @@ def make_config(updates: int = 2, **changes: object) -> TrainConfig:
         [
             f"num_worlds={WORLDS}",
             f"samples={updates * UPDATE}",
+            "algo.steps=12",
             "algo.actor_hidden=[32,32]",
             "algo.critic_hidden=[32,32]",
             "algo.autocast=fp32",
@@ -62,6 +63,7 @@ def test_it_learns_the_dummy_task(tmp_path: Path) -> None:
     trainer = make_trainer(tmp_path, updates=60)
     before = {name: value.clone() for name, value in all_weights(trainer).items()}
     summary = trainer.train()
+    assert summary is not None
     metrics = read_metrics(tmp_path / "metrics.csv")
     assert len(metrics["update"]) == 60
     assert sum(metrics["mean_reward"][-5:]) / 5 > 0.5 * metrics["mean_reward"][0]  # rewards are negative distances
@@ -124,6 +126,7 @@ def test_a_signal_ends_the_run_with_a_checkpoint(tmp_path: Path, number: signal.
     trainer.env.advance = interrupted  # type: ignore[method-assign]
     before = signal.getsignal(number)
     summary = trainer.train()
+    assert summary is not None
     assert signal.getsignal(number) is before
     assert summary.reason == f"stopped by {number.name}"
     assert summary.updates == 3
@@ -146,6 +149,7 @@ def test_a_nan_keeps_the_last_good_checkpoint(tmp_path: Path) -> None:
 
 def test_minutes_end_a_run(tmp_path: Path) -> None:
     summary = make_trainer(tmp_path, updates=10_000, minutes=0.5 / 60).train()
+    assert summary is not None
     assert summary.reason.startswith("minutes=")
     assert summary.seconds < 10
 

@@ -1,0 +1,291 @@
+"""Several processes that train one policy: the numbers of one process on all the data, exact resume, no orphans."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from dummy import DummyTask
+from test_policy import CPU, small_algo
+from torch import Tensor
+
+from pace.config import ConfigError, load_train_config
+from pace.predictor.network import PredictorNetwork
+from pace.predictor.regression import PredictorTrainer
+from pace.rl.checkpoint import CheckpointError, load_checkpoint
+from pace.rl.policy import Agent, RunningNorm
+from pace.rl.ppo import PPO
+from pace.rl.rollout import Rollout
+from pace.rl.run_folder import read_metrics
+from pace.rl.trainer import Trainer, summarise
+from pace.team import Team, suitable_size
+
+STEPS, WORLDS = 6, 32
+
+
+class ThreadTeam(Team):
+    """A team of threads of this process, with the arithmetic of the real one."""
+
+    board: dict[int, Any]
+
+    def __init__(self, rank: int, size: int, board: dict[int, Any], barrier: threading.Barrier) -> None:
+        super().__init__(rank, size)
+        self.board, self.barrier = board, barrier
+
+    def gather(self, value: Any) -> list[Any]:
+        self.board[self.rank] = value
+        self.barrier.wait()
+        values = [self.board[rank] for rank in range(self.size)]
+        self.barrier.wait()
+        return values
+
+    def mean_later(self, tensors: Sequence[Tensor]) -> Callable[[], None]:
+        everyone = self.gather([tensor.clone() for tensor in tensors])
+
+        def finish() -> None:
+            for index, tensor in enumerate(tensors):
+                tensor.copy_(torch.stack([theirs[index] for theirs in everyone]).mean(0))
+
+        return finish
+
+    def sum_(self, tensor: Tensor) -> Tensor:
+        return tensor.copy_(torch.stack(self.gather(tensor.clone())).sum(0))
+
+    def follow_(self, tensors: Sequence[Tensor]) -> None:
+        first = self.gather([tensor.clone() for tensor in tensors])[0]
+        for tensor, theirs in zip(tensors, first, strict=True):
+            tensor.copy_(theirs)
+
+
+def together(work: Callable[[Team], Any], size: int = 2) -> list[Any]:
+    """``work`` of each member of a team of threads, in the order of ranks."""
+    board, barrier, results = {}, threading.Barrier(size), [None] * size
+
+    def run(rank: int) -> None:
+        try:
+            results[rank] = work(ThreadTeam(rank, size, board, barrier))
+        finally:
+            if results[rank] is None:
+                barrier.abort()
+
+    threads = [threading.Thread(target=run, args=(rank,)) for rank in range(size)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return results
+
+
+def agent_of(seed: int = 3) -> Agent:
+    torch.manual_seed(seed)
+    return Agent(6, 7, 2, small_algo(autocast="fp32", epochs=1, minibatches=1), CPU)
+
+
+def filled_rollout(agent: Agent, worlds: slice) -> Rollout:
+    """The part ``worlds`` of a rollout of WORLDS worlds of made-up numbers, of ``agent``'s policy."""
+    generator = torch.Generator().manual_seed(9)
+
+    def draw(*shape: int) -> Tensor:
+        return torch.randn(STEPS, WORLDS, *shape, generator=generator)[:, worlds]
+
+    rollout = Rollout(DummyTask(worlds.stop - worlds.start), agent, STEPS)
+    rollout.policy.copy_(draw(6))
+    rollout.critic[:STEPS].copy_(draw(7))
+    with torch.no_grad():
+        rollout.scale.copy_(agent.actor.std)
+        rollout.loc.copy_(agent.actor.mlp(rollout.policy))
+        noise = draw(2)
+        rollout.action.copy_(rollout.loc + rollout.scale * noise)
+        rollout.log_prob.copy_(torch.distributions.Normal(rollout.loc, rollout.scale).log_prob(rollout.action).sum(-1))
+        rollout.value[:STEPS].copy_(agent.critic(rollout.critic[:STEPS]).squeeze(-1))
+    rollout.advantage.copy_(draw())
+    rollout.value_target.copy_(draw())
+    return rollout
+
+
+def test_two_halves_learn_what_the_whole_does() -> None:
+    def learn(agent: Agent, worlds: slice, team: Team) -> dict[str, float]:
+        return PPO(agent, small_algo(epochs=1, minibatches=1), team).update(filled_rollout(agent, worlds), 0.0)
+
+    whole, halves = agent_of(), (agent_of(), agent_of())
+    metrics = learn(whole, slice(0, WORLDS), Team())
+    parts = (slice(0, WORLDS // 2), slice(WORLDS // 2, WORLDS))
+    half_metrics = together(lambda team: learn(halves[team.rank], parts[team.rank], team))
+    assert half_metrics[0] == half_metrics[1]
+    assert half_metrics[0] == pytest.approx(metrics, rel=1e-4, abs=1e-6)
+    for half in halves:
+        for name, tensor in whole.state_dict().items():
+            torch.testing.assert_close(half.state_dict()[name], tensor, rtol=0, atol=2e-6, msg=name)
+    start = agent_of().state_dict()["critic.layers.0.weight"]
+    assert (whole.state_dict()["critic.layers.0.weight"] - start).abs().max() > 1e-4
+
+
+def test_moments_are_those_of_all_observations() -> None:
+    generator = torch.Generator().manual_seed(1)
+    first, second, third = (5.0 + 3.0 * torch.randn(count, 4, generator=generator) for count in (40, 30, 50))
+
+    def play(team: Team) -> RunningNorm:
+        norm = RunningNorm(4, 8.0)
+        norm.update(first)
+        before = norm.moments()
+        norm.update((second, third)[team.rank])
+        norm.pool(before, team)
+        return norm
+
+    everything = torch.cat((first, second, third)).double()
+    for norm in together(play):
+        assert norm.count.item() == 120
+        torch.testing.assert_close(norm.mean, everything.mean(0), rtol=1e-6, atol=0)
+        torch.testing.assert_close(norm.var, everything.var(0, unbiased=False), rtol=1e-5, atol=0)
+        expected = (first[0].double() - everything.mean(0)) / (everything.var(0, unbiased=False) + 1e-4).sqrt()
+        torch.testing.assert_close(norm(first[0]), expected.float(), rtol=1e-4, atol=1e-5)
+
+
+def test_the_predictor_of_a_team_is_one_and_its_error_that_of_all_samples() -> None:
+    config = load_train_config(["predictor.batches_per_update=3"]).predictor
+
+    torch.manual_seed(4)
+    networks = [PredictorNetwork(config), PredictorNetwork(config)]
+    networks[1].load_state_dict(networks[0].state_dict())
+    inputs, targets = torch.randn(2, STEPS, 16, 15), torch.randn(2, STEPS, 16, networks[0].output_size)
+    with torch.no_grad():
+        error = networks[0](inputs.flatten(0, 2)) - targets.flatten(0, 2)
+    expected = 100.0 * error[:, networks[0].slices["apex"]].square().sum(1).mean().sqrt()
+
+    def fit(team: Team) -> dict[str, float]:
+        trainer = PredictorTrainer(networks[team.rank], config, STEPS, 16, team)
+        trainer.inputs.copy_(inputs[team.rank])
+        trainer.targets.copy_(targets[team.rank])
+        trainer.valid.fill_(True)
+        return trainer.update()
+
+    before = networks[0].layers[0].weight.detach().clone()
+    first, second = together(fit)
+    assert first["predictor_rmse_cm"] == second["predictor_rmse_cm"] == pytest.approx(float(expected), rel=1e-5)
+    for one, other in zip(networks[0].parameters(), networks[1].parameters(), strict=True):
+        assert torch.equal(one, other)
+    assert not torch.equal(networks[0].layers[0].weight, before)
+
+
+def test_rates_count_every_process() -> None:
+    def rates(team: Team) -> dict[str, float]:
+        counts = {"serves": (4.0, 12.0), "hits": (4.0, 0.0), "successes": (1.0, 1.0), "falls": (0.0, 2.0)}
+        rest = {"steps": (50.0, 50.0), "episodes": (1.0, 2.0), "reward_sum": (5.0, 15.0)}
+        return summarise({name: torch.tensor(v[team.rank]) for name, v in (counts | rest).items()}, 0.02, team)
+
+    for row in together(rates):
+        assert row["hit_rate"] == 0.25
+        assert row["success_rate"] == 0.125
+        assert row["fall_rate"] == pytest.approx(1.0)
+        assert row["mean_reward"] == pytest.approx(0.2)
+
+
+def test_size_suits_the_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pace.team.usable_cores", lambda: 6)
+    assert suitable_size(8, CPU) == 1
+    assert suitable_size(1024, CPU) == 4
+    assert suitable_size(4096, CPU) == 4  # 6 and 5 do not divide it
+    assert suitable_size(6000, CPU) == 6
+    assert suitable_size(4096, torch.device("cuda")) == 1
+    with pytest.raises(ConfigError, match="cannot be shared equally by 3 processes"):
+        load_train_config(["num_worlds=1024", "processes=3"])
+
+
+def test_seeds_differ_between_processes_and_the_leaders_is_its_own() -> None:
+    seeds = [Team(rank, 4).seed(seed) for seed in (1, 2) for rank in range(4)]
+    assert len(set(seeds)) == 8
+    assert seeds[0] == 1
+    assert seeds[4] == 2
+
+
+def test_another_number_of_processes_cannot_resume(tmp_path: Path) -> None:
+    config = load_train_config(["num_worlds=8", "tensorboard=false", "progress=false"])
+    predictor = PredictorNetwork(config.predictor)
+    trainer = Trainer(config, DummyTask(8), predictor, None)
+    saved = trainer.checkpoint()
+    assert saved.training is not None
+    saved.training["processes"] *= 2
+    with pytest.raises(CheckpointError, match="written by 2 processes, and 1 cannot go on"):
+        trainer.resume(saved)
+
+
+# --- the command --------------------------------------------------------------------------------------------------
+
+UPDATE = 8 * 12
+SMALL = (
+    "num_worlds=8", "processes=2", "algo.steps=12", "algo.actor_hidden=[32]", "algo.critic_hidden=[32]",
+    "predictor.batches_per_update=2", "progress=false", "tensorboard=false",
+)  # fmt: skip
+
+
+def start(*arguments: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "pace.rl.train", *arguments]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def finish(process: subprocess.Popen[str]) -> tuple[int, str, str]:
+    out, err = process.communicate(timeout=240)
+    return process.returncode, out, err
+
+
+def wait_for_rows(run: Path, process: subprocess.Popen[str], rows: int = 2) -> None:
+    while process.poll() is None:
+        if (run / "metrics.csv").exists() and len((run / "metrics.csv").read_text().splitlines()) > rows:
+            return
+        time.sleep(0.05)
+    raise AssertionError(process.communicate())
+
+
+def children_of(pid: int) -> list[int]:
+    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def test_two_processes_train_and_resume_exactly(tmp_path: Path) -> None:
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    status, out, err = finish(start(f"run_dir={whole}", f"samples={3 * UPDATE}", *SMALL))
+    assert status == 0, err
+    assert "8 worlds on cpu in 2 processes" in out
+    assert f"3 updates, {3 * UPDATE} samples" in out
+    assert finish(start(f"run_dir={parts}", f"samples={2 * UPDATE}", *SMALL))[0] == 0
+    status, _, err = finish(start(f"resume={parts}", f"samples={3 * UPDATE}", "progress=false"))
+    assert status == 0, err
+    expected, resumed = load_checkpoint(whole), load_checkpoint(parts)
+    assert expected.counters["samples"] == resumed.counters["samples"] == 3 * UPDATE
+    assert expected.weights["agent"]["policy_norm.count"].item() == 3 * UPDATE
+    for part, tensors in expected.weights.items():
+        for name, tensor in tensors.items():
+            assert torch.equal(tensor, resumed.weights[part][name]), f"{part} {name}"
+    assert read_metrics(whole / "metrics.csv")["mean_reward"] == read_metrics(parts / "metrics.csv")["mean_reward"]
+    first, second = (worlds["env"]["worlds.position"] for worlds in expected.training["processes"])  # type: ignore[index]
+    assert not torch.equal(first, second)  # each process plays worlds of its own
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="looks for child processes in /proc")
+def test_ctrl_c_saves_and_a_lost_process_is_told(tmp_path: Path) -> None:
+    process = start(f"run_dir={tmp_path / 'stopped'}", "minutes=10", *SMALL)
+    wait_for_rows(tmp_path / "stopped", process)
+    children = children_of(process.pid)
+    process.send_signal(signal.SIGINT)
+    status, out, err = finish(process)
+    assert status == 0, err
+    assert "stopped by SIGINT" in out
+    updates = len(read_metrics(tmp_path / "stopped" / "metrics.csv")["update"])
+    assert load_checkpoint(tmp_path / "stopped").counters["updates"] == updates
+    assert len(children) == 1
+    assert not Path(f"/proc/{children[0]}").exists()
+
+    process = start(f"run_dir={tmp_path / 'lost'}", "minutes=10", *SMALL)
+    wait_for_rows(tmp_path / "lost", process)
+    os.kill(children_of(process.pid)[0], signal.SIGKILL)
+    status, _, err = finish(process)
+    assert status == 1
+    assert "error: process 1 of 2 ended with status -9" in err
