@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -33,20 +34,25 @@ STEPS, WORLDS = 6, 32
 
 
 class ThreadTeam(Team):
-    """A team of threads of this process, with the arithmetic of the real one."""
+    """A team of threads of this process, with the arithmetic of the real one; one at a time works, the others wait."""
 
-    board: dict[int, Any]
-
-    def __init__(self, rank: int, size: int, board: dict[int, Any], barrier: threading.Barrier) -> None:
-        super().__init__(rank, size)
-        self.board, self.barrier = board, barrier
+    def __init__(self, rank: int, board: list[Any], barrier: threading.Barrier, turn: threading.Lock) -> None:
+        super().__init__(rank, len(board))
+        self.board, self.barrier, self.turn = board, barrier, turn
 
     def gather(self, value: Any) -> list[Any]:
         self.board[self.rank] = value
-        self.barrier.wait()
-        values = [self.board[rank] for rank in range(self.size)]
-        self.barrier.wait()
+        self._meet()
+        values = list(self.board)
+        self._meet()
         return values
+
+    def _meet(self) -> None:
+        self.turn.release()
+        try:
+            self.barrier.wait()
+        finally:
+            self.turn.acquire()
 
     def mean_later(self, tensors: Sequence[Tensor]) -> Callable[[], None]:
         everyone = self.gather([tensor.clone() for tensor in tensors])
@@ -68,21 +74,18 @@ class ThreadTeam(Team):
 
 def together(work: Callable[[Team], Any], size: int = 2) -> list[Any]:
     """``work`` of each member of a team of threads, in the order of ranks."""
-    board, barrier, results = {}, threading.Barrier(size), [None] * size
+    board, barrier, turn = [None] * size, threading.Barrier(size), threading.Lock()
 
-    def run(rank: int) -> None:
+    def run(rank: int) -> Any:
         try:
-            results[rank] = work(ThreadTeam(rank, size, board, barrier))
-        finally:
-            if results[rank] is None:
-                barrier.abort()
+            with turn:
+                return work(ThreadTeam(rank, board, barrier, turn))
+        except BaseException:
+            barrier.abort()  # or the others would wait for this one for ever
+            raise
 
-    threads = [threading.Thread(target=run, args=(rank,)) for rank in range(size)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    return results
+    with ThreadPoolExecutor(size) as pool:
+        return [member.result() for member in [pool.submit(run, rank) for rank in range(size)]]
 
 
 def agent_of(seed: int = 3) -> Agent:
@@ -121,7 +124,8 @@ def test_two_halves_learn_what_the_whole_does() -> None:
     parts = (slice(0, WORLDS // 2), slice(WORLDS // 2, WORLDS))
     half_metrics = together(lambda team: learn(halves[team.rank], parts[team.rank], team))
     assert half_metrics[0] == half_metrics[1]
-    assert half_metrics[0] == pytest.approx(metrics, rel=1e-4, abs=1e-6)
+    of_parts = {"explained_variance": metrics["explained_variance"]}  # a share of variance, which is each part's own
+    assert half_metrics[0] | of_parts == pytest.approx(metrics, rel=1e-4, abs=1e-6)
     for half in halves:
         for name, tensor in whole.state_dict().items():
             torch.testing.assert_close(half.state_dict()[name], tensor, rtol=0, atol=2e-6, msg=name)
