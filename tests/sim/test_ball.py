@@ -65,12 +65,12 @@ def test_flights_to_bounce_and_apex_agree_with_the_ode_solution():
     path, time, place = far_path(1000), torch.full((1000,), torch.nan), torch.zeros(1000, 3)
     apex_time, apex = np.full(1000, np.nan), np.zeros((1000, 3))
     for step in range(60):
-        before = [a.numpy().astype(float) for a in (sim.position, sim.velocity)]
+        start, start_velocity = (a.numpy().astype(float) for a in (sim.position, sim.velocity))
         sim.fly(path)
         first = (sim.events.own_bounce > 0) & time.isnan()
         time = torch.where(first, step * DT + sim.events.own_bounce_time, time)
         place = torch.where(first.unsqueeze(1), sim.events.bounce_position, place)
-        summit, where = highest_point(*before, sim.position.numpy(), sim.velocity.numpy())
+        summit, where = highest_point(start, start_velocity, sim.position.numpy(), sim.velocity.numpy())
         passed = ~time.isnan().numpy() & ~first.numpy() & np.isnan(apex_time) & ~np.isnan(summit)
         apex_time[passed], apex[passed] = step * DT + summit[passed], where[passed]
     assert not time.isnan().any()
