@@ -97,7 +97,7 @@ def limbs_only(model: mujoco.MjModel) -> mujoco.MjModel:
     """The model with the contacts of CONVEX_BODIES taken away."""
     geoms = [model.geom(body).id for body in CONVEX_BODIES]
     pairs = np.isin(model.pair_geom1, geoms) | np.isin(model.pair_geom2, geoms)
-    model.pair_margin[pairs] = model.pair_gap[pairs] = -1.0  # m: nothing sinks in that deep
+    model.pair_margin[pairs] = -1.0  # m: nothing sinks in that deep
     return model
 
 
