@@ -48,15 +48,13 @@ def test_engines_agree_for_a_second_within_the_stated_tolerances(found: Found) -
         assert d.joints[:5].max() < 1e-4, scenario  # all worlds, 100 ms
         if scenario != "striking":  # there the paddle touches the leg in half of the worlds
             assert np.median(d.joints[-1]) < 1e-4, scenario
-        clean = d.worlds(~d.convex)
+        clean = d if scenario == "falling, limbs only" else d.worlds(~d.convex)
         struck = clean.ball[list(parity.THROWS)]
         pose = ((clean.joints, 1e-3), (clean.base, 1e-3), (clean.angle, 1e-3))
         for values, tolerance in (*pose, (clean.load, 0.1), (struck, 1e-3)):
             assert values.max(initial=0.0) < tolerance, scenario
-    for scenario in ("standing", "falling, limbs only", "striking"):
+    for scenario in ("standing", "striking"):
         assert not found[scenario]["mjwarp"].convex.all()
-    # a fall without the contacts that the engines find in different ways: every world of it
-    assert not found["falling, limbs only"]["mjwarp"].convex.any()
 
 
 def test_a_play_falls_stands_and_strikes_as_it_says() -> None:
