@@ -34,7 +34,9 @@ def test_a_limp_arm_takes_the_impulse_as_a_free_mass_would(strikes: reaction.Str
     assert np.median(share) == pytest.approx(1.0, abs=0.1)
     assert share.max() < 1.05  # an arm that comes to the end of a joint gives way less
     blow = (1.878 - 0.02 * strikes.speed) * strikes.speed  # 1 + e of the preset, in mid-swing
-    np.testing.assert_allclose(strikes.impulse, 0.0027 * blow, rtol=0.2)
+    hardness = strikes.impulse / (0.0027 * blow)
+    assert np.median(hardness) == pytest.approx(1.0, abs=0.05)
+    assert 0.7 < hardness.min() < hardness.max() < 1.3  # one arm is stopped by the leg in the step of the strike
     assert np.all(strikes.ball_change < 0.03 * blow)
     assert 0 < reaction.cost(num_worlds=4, repeats=3) < 0.1
 
@@ -44,10 +46,12 @@ def test_engines_agree_for_a_second_within_the_stated_tolerances(found: Found) -
         d = others["mjwarp"]
         assert d.joints.shape == (parity.STEPS, 4)
         assert d.joints[:5].max() < 1e-4, scenario  # all worlds, 100 ms
-        assert np.median(d.joints[-1]) < 1e-4, scenario
-        clean = d.worlds(~d.convex)
+        if scenario != "striking":  # there the paddle touches the leg in half of the worlds
+            assert np.median(d.joints[-1]) < 1e-4, scenario
+        clean = d if scenario == "falling, limbs only" else d.worlds(~d.convex)
         struck = clean.ball[list(parity.THROWS)]
-        for values, tolerance in ((clean.joints, 1e-3), (clean.base, 1e-3), (clean.load, 0.1), (struck, 1e-3)):
+        pose = ((clean.joints, 1e-3), (clean.base, 1e-3), (clean.angle, 1e-3))
+        for values, tolerance in (*pose, (clean.load, 0.1), (struck, 1e-3)):
             assert values.max(initial=0.0) < tolerance, scenario
     for scenario in ("standing", "striking"):
         assert not found[scenario]["mjwarp"].convex.all()
@@ -61,7 +65,9 @@ def test_a_play_falls_stands_and_strikes_as_it_says() -> None:
         plays[name] = parity.play("native", 0.0, scenario, balls)
         assert len(balls) == (len(parity.THROWS) if name == "striking" else 0)
     assert (plays["standing"].base[-1, :, 2] > 0.5).all()
-    assert (plays["falling"].base[-1, :, 2] < 0.5).all()
+    for name in ("falling", "falling, limbs only"):
+        assert (plays[name].base[-1, :, 2] < 0.5).all()
+    assert plays["falling"].touched.any()
     speeds = np.linalg.norm(plays["striking"].ball, axis=2)
     assert (speeds[parity.THROWS[0]] > 1.0).all()
 
@@ -82,9 +88,9 @@ def test_errors_fall_with_the_step_and_are_those_of_the_step_on_both_engines(mon
 
 
 def test_the_default_solver_limits_converge() -> None:
-    cases = {case.name: case.deviation for case in steps.solver_cases(random_swings(2, 15).windows(15))}
-    assert cases["10 and 10 iterations"].paddle.max() < 1e-6
-    assert cases["2 and 4 iterations"].paddle.max() > 1e-4
+    cases = {case.name: case.deviation for case in steps.solver_cases(random_swings(2, 15).windows(15), ("native",))}
+    assert cases["native, 10 and 10 iterations"].paddle.max() < 1e-6
+    assert cases["native, 2 and 4 iterations"].paddle.max() > 1e-4
 
 
 def test_windows_leave_out_resets() -> None:

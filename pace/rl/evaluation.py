@@ -175,7 +175,8 @@ class Row:
 def play(env: TableTennisEnv, policy: TaskPolicy, recorder: ServeRecorder, on_count: OnCount | None = None) -> None:
     """Play until every world has its serves. ``on_count`` hears how many have been counted in all.
 
-    Errors: :class:`EvaluationError` when serves keep missing the robot's half, or a value is not finite.
+    Errors: :class:`EvaluationError` when serves keep missing the robot's half, or a value is not finite. A
+    ``RuntimeWarning`` when the engine had no room for all contacts.
     """
     total = env.num_worlds * recorder.quota
     longest = math.ceil(env.config.serve.max_duration / env.worlds.control_dt) + 1
@@ -196,6 +197,7 @@ def play(env: TableTennisEnv, policy: TaskPolicy, recorder: ServeRecorder, on_co
     bad = env.first_bad()
     if bad is not None:
         raise EvaluationError(bad)
+    env.worlds.warn_of_overflow()
 
 
 def evaluate_row(

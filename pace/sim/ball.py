@@ -316,7 +316,8 @@ class BallSim:
         """Fly one control step along ``paddle_path`` (N, S + 1, 12), world frame, S + 1 equidistant instants:
         centre (m), unit normal of a face, velocity of the centre (m/s), angular velocity (rad/s).
 
-        Between the instants the centre follows a cubic, normal and angular velocity are interpolated linearly.
+        Between the instants centre and normal follow cubics through their own values (the velocities are used only
+        where S = 1), and the angular velocity is interpolated linearly.
         Give the same tensor each time: another one is bound anew, which takes longer.
 
         Errors: ``ValueError`` for another shape, type or memory layout.

@@ -168,14 +168,33 @@ def arc_velocity(arc: Arc, time: float) -> wp.vec3:
 
 
 @wp.func
+def _rate(scene: Scene, world: int, knot: int, first: int) -> wp.vec3:
+    """Rate of the centre (``first`` 0) or normal (3) at a knot, from the parabola through it and its neighbours.
+
+    An engine's velocities are those of half a physics step before its positions (semi-implicit Euler). A cubic through
+    both would swing about the motion by 0.2 m/s within a step of 10 ms. They serve only where there are no three knots.
+    """
+    last = scene.path.shape[1] - 1
+    if last < 2:
+        if first == 0:
+            return _read_vec3(scene.path, world, knot, 6)
+        return wp.cross(_read_vec3(scene.path, world, knot, 9), _read_vec3(scene.path, world, knot, 3))
+    middle = wp.clamp(knot, 1, last - 1)
+    before = _read_vec3(scene.path, world, middle - 1, first)
+    after = _read_vec3(scene.path, world, middle + 1, first)
+    bend = before - 2.0 * _read_vec3(scene.path, world, middle, first) + after
+    return (0.5 * (after - before) + float(knot - middle) * bend) / scene.path_dt
+
+
+@wp.func
 def paddle_centre(scene: Scene, world: int, clock: float) -> wp.vec3:
     """Centre of the paddle ``clock`` s into the control step."""
     knot = wp.clamp(int(clock / scene.path_dt), 0, scene.path.shape[1] - 2)
     return _hermite(
         _read_vec3(scene.path, world, knot, 0),
-        _read_vec3(scene.path, world, knot, 6),
+        _rate(scene, world, knot, 0),
         _read_vec3(scene.path, world, knot + 1, 0),
-        _read_vec3(scene.path, world, knot + 1, 6),
+        _rate(scene, world, knot + 1, 0),
         scene.path_dt,
         clock / scene.path_dt - float(knot),
     )
@@ -188,13 +207,15 @@ def paddle_pose(scene: Scene, world: int, clock: float) -> Pose:
     s = clock / scene.path_dt - float(knot)
     p0 = _read_vec3(scene.path, world, knot, 0)
     p1 = _read_vec3(scene.path, world, knot + 1, 0)
-    v0 = _read_vec3(scene.path, world, knot, 6)
-    v1 = _read_vec3(scene.path, world, knot + 1, 6)
+    v0 = _rate(scene, world, knot, 0)
+    v1 = _rate(scene, world, knot + 1, 0)
+    n0 = _read_vec3(scene.path, world, knot, 3)
+    n1 = _read_vec3(scene.path, world, knot + 1, 3)
     pose = Pose()
     pose.centre = _hermite(p0, v0, p1, v1, scene.path_dt, s)
     pose.velocity = _hermite_velocity(p0, v0, p1, v1, scene.path_dt, s)
     pose.normal = wp.normalize(
-        wp.lerp(_read_vec3(scene.path, world, knot, 3), _read_vec3(scene.path, world, knot + 1, 3), s)
+        _hermite(n0, _rate(scene, world, knot, 3), n1, _rate(scene, world, knot + 1, 3), scene.path_dt, s)
     )
     pose.rotation = wp.lerp(_read_vec3(scene.path, world, knot, 9), _read_vec3(scene.path, world, knot + 1, 9), s)
     return pose
@@ -207,9 +228,7 @@ def paddle_speed_bound(scene: Scene, world: int) -> float:
     for knot in range(scene.path.shape[1] - 1):
         p0 = _read_vec3(scene.path, world, knot, 0)
         p1 = _read_vec3(scene.path, world, knot + 1, 0)
-        knots = wp.max(
-            wp.length(_read_vec3(scene.path, world, knot, 6)), wp.length(_read_vec3(scene.path, world, knot + 1, 6))
-        )
+        knots = wp.max(wp.length(_rate(scene, world, knot, 0)), wp.length(_rate(scene, world, knot + 1, 0)))
         turning = wp.max(
             wp.length(_read_vec3(scene.path, world, knot, 9)), wp.length(_read_vec3(scene.path, world, knot + 1, 9))
         )

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, fields
 
+import mujoco
 import torch
 import warp as wp
 from torch import Tensor
@@ -84,6 +86,7 @@ class Worlds:
         num_worlds: N.
         device: ``auto``, ``cpu``, ``cuda`` or ``cuda:1``; ``auto`` takes the first GPU where there is one.
         generator: source of every random draw, on the worlds' device; ``None`` makes one with seed 0.
+        model: robot and scene; ``None`` builds them from ``config``.
     """
 
     joint_names = JOINT_NAMES
@@ -94,13 +97,14 @@ class Worlds:
         num_worlds: int,
         device: str | torch.device = "auto",
         generator: torch.Generator | None = None,
+        model: mujoco.MjModel | None = None,
     ) -> None:
         self.config = config
         self.num_worlds = num_worlds
         self.device = resolve_device(device)
         self.control_dt = config.robot.control_dt
         self.generator = generator or torch.Generator(self.device).manual_seed(0)
-        self.model = build_model(config.robot, config.engine, config.ball.table)
+        self.model = model or build_model(config.robot, config.engine, config.ball.table)
         self.engine = make_engine(self.model, config.engine, num_worlds, self.device, config.substeps)
         self.kinematics = Kinematics(self.model, num_worlds, config.substeps, self.device)
         self.ball = BallSim(
@@ -122,6 +126,7 @@ class Worlds:
             self.control_dt,
         )
         self.engine.apply_params(torch.ones(num_worlds, dtype=torch.bool, device=self.device))
+        self._warned = False
         self._allocate()
 
     def _allocate(self) -> None:
@@ -230,6 +235,21 @@ class Worlds:
         states = (self.ball.position, self.ball.velocity, self.ball.spin)
         for target, value in zip(states, (position, velocity, spin), strict=True):
             target.copy_(torch.where(wide, value, target))
+
+    def warn_of_overflow(self) -> None:
+        """Warn, once, when a world ever had more contacts or constraints than there is room for: the engine has dropped
+        the others. Waits for the device: ask once an update, not every step."""
+        if self._warned or not self.engine.overflowed():
+            return
+        self._warned = True
+        engine = self.config.engine
+        warnings.warn(
+            "a world had more contacts or constraints than there is room for; some were dropped, and its robot may "
+            "have sunk into something. With engine=mjwarp raise engine.contacts_per_world "
+            f"({engine.contacts_per_world}) and engine.constraints_per_world ({engine.constraints_per_world}).",
+            RuntimeWarning,
+            stacklevel=2,
+        )
 
     def state_dict(self) -> dict[str, Tensor]:
         """All that the next control step depends on, besides the random generator."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
+import mujoco
 import numpy as np
 import torch
 from matplotlib.figure import Figure
@@ -17,7 +18,7 @@ from torch import Tensor
 
 from pace.sim.robot import CONTACT_BODIES
 from pace.sim.worlds import Worlds
-from pace.studies.common import COLOURS, Array, markdown, smooth_swings, standing, study_config
+from pace.studies.common import COLOURS, Array, markdown, model_of, smooth_swings, standing, study_config
 from pace.studies.throws import throw
 
 STEPS = 50  # control steps: one second
@@ -28,8 +29,9 @@ SEED = 11
 #: What is compared with ``native``.
 OTHERS = {"mjwarp": ("mjwarp", 0.0), "native, 1 μrad beside": ("native", NUDGE)}
 
-#: Columns of ``body_contact`` of the bodies whose contacts are found by a general convex algorithm.
-CONVEX = [CONTACT_BODIES.index(body) for body in ("trunk", "paddle")]
+#: Bodies (a box, a cylinder) whose contacts are found by a general convex algorithm, and their ``body_contact``.
+CONVEX_BODIES = ("trunk", "paddle")
+CONVEX = [CONTACT_BODIES.index(body) for body in CONVEX_BODIES]
 
 Balls = list[tuple[Tensor, Tensor]]
 
@@ -65,15 +67,17 @@ class Difference:
 
 @dataclass(frozen=True)
 class Scenario:
-    """Start velocities (N, 27), joint targets (T, N, 21) rad, and whether balls are thrown at the paddle."""
+    """Start velocities (N, 27), joint targets (T, N, 21) rad, whether balls are thrown at the paddle, and which
+    bodies touch."""
 
     velocity: Tensor
     targets: Tensor
-    strikes: bool
+    strikes: bool = False
+    convex: bool = True  # CONVEX_BODIES touch what they meet; otherwise they pass through it
 
 
 def scenarios(num_worlds: int, nominal: Tensor) -> dict[str, Scenario]:
-    """Standing under shaking joints; falling over; strikes in the middle of swings."""
+    """Standing under shaking joints; falling over, with and without general convex contacts; strikes in mid-swing."""
     generator = torch.Generator().manual_seed(SEED)
     shaking = torch.randn(STEPS, num_worlds, 21, generator=generator)
     still = torch.zeros(num_worlds, 27)
@@ -82,10 +86,19 @@ def scenarios(num_worlds: int, nominal: Tensor) -> dict[str, Scenario]:
     pushed[:, 0], pushed[:, 1] = 2.0 * angle.cos(), 2.0 * angle.sin()
     swings = smooth_swings(nominal, num_worlds, STEPS, SEED, arm=0.5, rest=0.02)
     return {
-        "standing": Scenario(still, nominal + 0.1 * shaking, False),
-        "falling": Scenario(pushed, nominal + 0.25 * shaking, False),
-        "striking": Scenario(still, swings, True),
+        "standing": Scenario(still, nominal + 0.1 * shaking),
+        "falling": Scenario(pushed, nominal + 0.25 * shaking),
+        "falling, limbs only": Scenario(pushed, nominal + 0.25 * shaking, convex=False),
+        "striking": Scenario(still, swings, strikes=True),
     }
+
+
+def limbs_only(model: mujoco.MjModel) -> mujoco.MjModel:
+    """The model with the contacts of CONVEX_BODIES taken away."""
+    geoms = [model.geom(body).id for body in CONVEX_BODIES]
+    pairs = np.isin(model.pair_geom1, geoms) | np.isin(model.pair_geom2, geoms)
+    model.pair_margin[pairs] = -1.0  # m: nothing sinks in that deep
+    return model
 
 
 def play(engine: str, nudge: float, scenario: Scenario, balls: Balls) -> Play:
@@ -93,7 +106,8 @@ def play(engine: str, nudge: float, scenario: Scenario, balls: Balls) -> Play:
     config = study_config(name=engine)
     count = scenario.velocity.shape[0]
     everyone = torch.ones(count, dtype=torch.bool)
-    worlds = Worlds(config, count, "cpu")
+    model = model_of(config) if scenario.convex else limbs_only(model_of(config))
+    worlds = Worlds(config, count, "cpu", model=model)
     qpos = standing(config, count)
     qpos[:, 7:] += nudge
     worlds.reset_robot(everyone, qpos, scenario.velocity)

@@ -104,21 +104,25 @@ def step_cases(windows: Windows) -> list[Case]:
     return [*cases, Case(name, deviation(elliptic, reference), elliptic.cost)]
 
 
-def solver_cases(windows: Windows) -> list[Case]:
-    """Limits of the solver, cone and dry friction on the native engine, against the default step solved to the end."""
+def solver_cases(windows: Windows, engines: tuple[str, ...] = ENGINES) -> list[Case]:
+    """Limits of the solver, cone and dry friction: each engine against its default step solved to the end."""
     full: dict[str, object] = {"solver_iterations": 100, "line_search_iterations": 50}
-    converged = replay(windows, full)
     default = study_config().engine
     limits = ((2, 4), (4, 6), (6, 8), (default.solver_iterations, default.line_search_iterations), (20, 20))
-    motions = {
-        f"{n} and {m} iterations": replay(windows, {"solver_iterations": n, "line_search_iterations": m})
-        for n, m in limits
+    settings: dict[str, dict[str, object]] = {
+        f"{n} and {m} iterations": {"solver_iterations": n, "line_search_iterations": m} for n, m in limits
     }
-    motions["elliptic cone"] = replay(windows, {"cone": "elliptic"})
-    motions["elliptic cone, solved to the end"] = replay(windows, full | {"cone": "elliptic"})
-    for loss in (0.1, 0.5):
-        motions[f"friction loss {loss} N m"] = replay(windows, {}, loss)
-    return [Case(name, deviation(motion, converged), motion.cost) for name, motion in motions.items()]
+    settings |= {"elliptic cone": {"cone": "elliptic"}, "elliptic cone, solved to the end": full | {"cone": "elliptic"}}
+    cases = []
+    for engine in engines:
+        converged = replay(windows, full | {"name": engine})
+        motions = {name: replay(windows, options | {"name": engine}) for name, options in settings.items()}
+        for loss in (0.1, 0.5):
+            motions[f"friction loss {loss} N m"] = replay(windows, {"name": engine}, loss)
+        cases += [
+            Case(f"{engine}, {name}", deviation(motion, converged), motion.cost) for name, motion in motions.items()
+        ]
+    return cases
 
 
 def table(cases: list[Case]) -> str:

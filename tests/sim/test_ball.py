@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields
 
 import numpy as np
 import pytest
 import torch
+from scipy.interpolate import CubicHermiteSpline
 from torch import Tensor
 
 from pace.config import ConfigError, load_train_config
 from pace.sim import reference
 from pace.sim.aero import GRAVITY
 from pace.sim.ball import DEFAULT_PRESET, BallEvents, BallParams, BallSim, ball_preset
+from pace.sim.robot import JOINT_NAMES
 from pace.sim.trials import (
     CONTROL_DT,
     NO_AIR,
@@ -27,6 +30,7 @@ from pace.sim.trials import (
     put,
     random_strikes,
 )
+from pace.sim.worlds import Worlds
 
 DT = CONTROL_DT
 TOP = TABLE.height
@@ -39,21 +43,42 @@ def fly_steps(sim: BallSim, steps: int) -> None:
         sim.fly(path)
 
 
-def test_flights_up_to_the_bounce_agree_with_the_ode_solution():
+def highest_point(
+    start: np.ndarray, start_velocity: np.ndarray, end: np.ndarray, end_velocity: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """When (N,) s into a control step of free flight a ball stops rising, NaN if it does not, and where (N, 3) m: on
+    the cubic through both ends."""
+    curve = CubicHermiteSpline([0.0, DT], np.stack([start, end]), np.stack([start_velocity, end_velocity]))
+    time = np.full(len(start), np.nan)
+    turning = (start_velocity[:, 2] > 0) & (end_velocity[:, 2] <= 0)
+    roots = curve.derivative().roots(extrapolate=False)[:, 2]
+    time[turning] = [root[0] for root in roots[turning]]
+    place = np.array([curve(t)[i] for i, t in enumerate(time)])
+    return time, place
+
+
+def test_flights_to_bounce_and_apex_agree_with_the_ode_solution():
     serves = reference.random_serves(1000)
     given = {f.name: torch.tensor(getattr(serves.ball, f.name)) for f in fields(serves.ball)}
     sim = make_sim(1000, BallParams(**given, paddle_restitution=0.8, paddle_restitution_slope=0.0, paddle_friction=0.3))
     put(sim, serves.position, serves.velocity, serves.spin)
     path, time, place = far_path(1000), torch.full((1000,), torch.nan), torch.zeros(1000, 3)
-    for step in range(50):
+    apex_time, apex = np.full(1000, np.nan), np.zeros((1000, 3))
+    for step in range(60):
+        start, start_velocity = (a.numpy().astype(float) for a in (sim.position, sim.velocity))
         sim.fly(path)
         first = (sim.events.own_bounce > 0) & time.isnan()
         time = torch.where(first, step * DT + sim.events.own_bounce_time, time)
         place = torch.where(first.unsqueeze(1), sim.events.bounce_position, place)
+        summit, where = highest_point(start, start_velocity, sim.position.numpy(), sim.velocity.numpy())
+        passed = ~time.isnan().numpy() & ~first.numpy() & np.isnan(apex_time) & ~np.isnan(summit)
+        apex_time[passed], apex[passed] = step * DT + summit[passed], where[passed]
     assert not time.isnan().any()
     # Asked for: 0.5 ms and 1 mm. Measured: 1 us and 3 um.
     np.testing.assert_allclose(time.numpy(), serves.flight.bounce_time, atol=1e-5)
     np.testing.assert_allclose(place.numpy(), serves.flight.bounce, atol=2e-5)
+    np.testing.assert_allclose(apex_time, serves.flight.apex_time, atol=1e-5)
+    np.testing.assert_allclose(apex, serves.flight.apex, atol=2e-5)
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -139,26 +164,28 @@ def test_events_of_one_step_are_in_order_and_gone_in_the_next():
 
 
 def test_strikes_by_a_swinging_turning_paddle_agree_with_the_balance_of_momentum():
-    sim, swing, moment, contact = random_strikes(300)
-    spin = sim.spin.clone().numpy().astype(float)
-    sim.fly(swing.path(np.zeros(300)))
+    count = 1000
+    sim, meetings, start = random_strikes(count)
+    swing, contact, now = meetings.swing, meetings.contact, np.zeros(count)
+    sim.fly(swing.path(start))
     events = {f.name: getattr(sim.events, f.name).numpy() for f in fields(BallEvents)}
     assert np.all(events["paddle_hit"] >= 1)
-    np.testing.assert_allclose(events["paddle_hit_time"], moment, atol=2e-5)
-    np.testing.assert_allclose(events["hit_position"], contact, atol=2e-4)
-    centre, normal, _ = swing.at(moment)
-    np.testing.assert_allclose(events["hit_normal"], normal, atol=1e-3)
-    np.testing.assert_allclose(events["hit_offset"], contact - centre, atol=2e-4)
-    np.testing.assert_allclose(events["hit_point"], contact - 0.02 * normal, atol=2e-4)
-    surface = swing.surface_velocity(contact - 0.02 * normal, moment)
+    np.testing.assert_allclose(events["paddle_hit_time"], -start, atol=5e-6)
+    np.testing.assert_allclose(events["hit_position"], contact, atol=5e-5)
+    centre, normal, _ = swing.at(now)
+    np.testing.assert_allclose(events["hit_normal"], normal, atol=3e-4)
+    np.testing.assert_allclose(events["hit_offset"], contact - centre, atol=5e-5)
+    np.testing.assert_allclose(events["hit_point"], contact - 0.02 * normal, atol=5e-5)
+    surface = swing.surface_velocity(contact - 0.02 * normal, now)
     speed_in = events["hit_velocity_in"].astype(float)
-    np.testing.assert_allclose(events["hit_relative_velocity"], speed_in - surface, atol=5e-3)
-    one = np.ones(300)
-    out, out_spin = reference.rebound(speed_in, spin, normal, surface, 0.02 * one, 0.8 * one, 0.3 * one)
-    np.testing.assert_allclose(events["hit_velocity_out"], out, atol=1e-2)
-    np.testing.assert_allclose(events["hit_spin_out"], out_spin, atol=1.0)
+    np.testing.assert_allclose(speed_in, meetings.velocity, atol=1e-4)
+    np.testing.assert_allclose(events["hit_relative_velocity"], speed_in - surface, atol=1e-3)
+    one = np.ones(count)
+    out, out_spin = reference.rebound(speed_in, meetings.spin, normal, surface, 0.02 * one, 0.8 * one, 0.3 * one)
+    np.testing.assert_allclose(events["hit_velocity_out"], out, atol=5e-3)
+    np.testing.assert_allclose(events["hit_spin_out"], out_spin, atol=0.3)
     once = events["paddle_hit"] == 1
-    np.testing.assert_allclose(events["paddle_impulse"][once], -0.0027 * (out - speed_in)[once], atol=5e-5)
+    np.testing.assert_allclose(events["paddle_impulse"][once], -0.0027 * (out - speed_in)[once], atol=2e-5)
     np.testing.assert_allclose(events["impulse_point"][once], events["hit_point"][once], atol=1e-6)
     assert not events["hit_rim"].any()
 
@@ -175,8 +202,41 @@ def test_strikes_do_not_depend_on_the_frame(velocity: tuple[float, float, float]
 @pytest.mark.parametrize("substeps", [2, 4, 10])
 def test_strikes_do_not_depend_on_where_in_a_step_they_fall(substeps: int):
     share, spin = phase_spread(substeps)
-    assert share < 1e-3
-    assert spin < 2e-3
+    assert share.max() < 1e-3
+    assert spin.max() < 0.3
+
+
+def test_an_engines_path_gives_the_ball_a_smooth_paddle():
+    """The struck point's velocity at 100 instants of one control step of a real swing lies on a parabola.
+
+    An engine's velocities lag half a physics step behind its positions; taken as they are, they would make it swing.
+    """
+    phases = 100
+    config = load_train_config(["engine=native", "engine.threads=1", "randomization=none"])
+    worlds = Worlds(config, phases, "cpu")
+    everyone = torch.ones(phases, dtype=torch.bool)
+    qpos = torch.as_tensor(worlds.model.key_qpos[0], dtype=torch.float32).repeat(phases, 1)
+    worlds.reset_robot(everyone, qpos, torch.zeros(phases, 27))
+    targets = worlds.nominal.repeat(phases, 1)
+    targets[:, [JOINT_NAMES.index("Waist"), JOINT_NAMES.index("Right_Shoulder_Pitch")]] += 0.5
+    for _ in range(2):
+        worlds.step(targets)
+    paddle = worlds.kinematics.paddle_path[:, -1]
+    assert worlds.config.substeps == 2
+    moment = torch.linspace(0.001, 0.017, phases).unsqueeze(1)
+    normal, velocity = paddle[:, 3:6], paddle[:, 6:9]
+    worlds.serve(
+        everyone, paddle[:, :3] + (REACH + 8.0 * moment) * normal, velocity - 8.0 * normal, torch.zeros(phases, 3)
+    )
+    worlds.step(targets)
+    events = worlds.ball.events
+    assert (events.paddle_hit == 1).all()
+    surface = (events.hit_velocity_in - events.hit_relative_velocity).numpy()
+    time = events.paddle_hit_time.numpy()
+    assert np.ptp(surface, axis=0).max() > 0.2  # it accelerates by more than 10 m/s^2
+    for along in surface.T:
+        curve = np.polynomial.Polynomial.fit(time, along, 3)
+        np.testing.assert_allclose(curve(time), along, atol=0.01)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
@@ -261,6 +321,98 @@ def test_no_ball_passes_the_net_at_30_m_per_s():
     np.testing.assert_array_equal(hit[clear], (height < edge)[clear])
     full = height < TOP + TABLE.net_height
     assert bool((sim.position[:, 0].numpy()[full] > 0.02).all())
+
+
+def first_touch(gap: Callable[[np.ndarray], np.ndarray], count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Smallest gap (N,) m of a control step, sampled every 10 us, and the first sample (N,) s that is below zero."""
+    time, least = np.full(count, np.inf), np.full(count, np.inf)
+    for moment in np.arange(0.0, DT, 1e-5):
+        now = gap(np.full(count, moment))
+        time = np.where((now < 0) & np.isinf(time), moment, time)
+        least = np.minimum(least, now)
+    return least, time
+
+
+def test_strikes_of_turning_paddles_at_30_m_per_s_are_those_that_fine_sampling_finds():
+    """Any side of a turning blade, face, rim and edge: NumPy distances every 10 us say who touches, and when."""
+    count = 2000
+    rng = np.random.default_rng(12)
+    normal, aim, flight = (rng.normal(size=(count, 3)) for _ in range(3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    flight *= 30.0 / np.linalg.norm(flight, axis=1, keepdims=True)
+    centre = np.full((count, 3), [0.0, 0.0, 5.0])
+    # The blade has what velocity it likes; ``flight`` is the ball's against it.
+    swing = Swing(centre, normal, rng.uniform(-10, 10, (count, 3)), rng.uniform(-10, 10, (count, 3)))
+    moment = rng.uniform(0.004, 0.02, (count, 1))
+    near = 0.1 * aim / np.linalg.norm(aim, axis=1, keepdims=True) * rng.random((count, 1))
+    velocity = swing.velocity + flight
+    start = centre + near - flight * moment
+    gravity = np.array([0.0, 0.0, -GRAVITY])
+
+    def gap(time: np.ndarray) -> np.ndarray:
+        at, axis, _ = swing.at(time)
+        offset = start + velocity * time[:, None] + 0.5 * gravity * time[:, None] ** 2 - at
+        height = np.sum(offset * axis, axis=1)
+        beyond = np.sqrt(np.maximum(np.sum(offset**2, axis=1) - height**2, 0.0)) - TABLE.paddle_radius
+        above = np.abs(height) - TABLE.paddle_half_thickness
+        return np.hypot(np.maximum(beyond, 0.0), np.maximum(above, 0.0)) - 0.02
+
+    sim = make_sim(count)
+    put(sim, start, velocity)
+    sim.fly(swing.path(np.zeros(count)))
+    least, time = first_touch(gap, count)
+    clear = (np.abs(least) > 2e-4) & (gap(np.zeros(count)) > 1e-3) & (np.isinf(time) | (time < DT - 5e-5))
+    assert clear.sum() > 1000
+    assert 300 < (least[clear] < 0).sum() < clear.sum() - 100
+    np.testing.assert_array_equal(sim.events.paddle_hit.numpy()[clear] > 0, least[clear] < 0)
+    struck = clear & (least < 0)
+    np.testing.assert_allclose(sim.events.paddle_hit_time.numpy()[struck], time[struck], atol=2e-4)
+    assert np.median(np.abs(sim.events.paddle_hit_time.numpy()[struck] - time[struck])) < 1e-5
+
+
+def test_contacts_with_table_and_net_at_30_m_per_s_are_those_that_fine_sampling_finds():
+    """Flown from all sides at edges, corners and faces: NumPy distances every 10 us say what is touched first."""
+    count = 2000
+    rng = np.random.default_rng(13)
+    table = np.array([0.0, 0.0, TOP - TABLE.thickness / 2]), np.array([1.37, 0.7625, TABLE.thickness / 2])
+    net = np.array([0.0, 0.0, TOP + 0.07625]), np.array([0.001, 0.915, 0.07625])
+    chosen = rng.random((count, 1)) < 0.5
+    corner = np.sign(rng.uniform(-1, 1, (count, 3))) * np.where(
+        rng.random((count, 3)) < 0.6, 1.0, rng.random((count, 3))
+    )
+    aim = np.where(chosen, table[0] + corner * table[1], net[0] + corner * net[1]) + rng.uniform(
+        -0.025, 0.025, (count, 3)
+    )
+    velocity = rng.normal(size=(count, 3))
+    velocity *= 30.0 / np.linalg.norm(velocity, axis=1, keepdims=True)
+    start = aim - velocity * rng.uniform(0.002, 0.015, (count, 1))
+
+    def gap_to(box: tuple[np.ndarray, np.ndarray]) -> Callable[[np.ndarray], np.ndarray]:
+        def gap(time: np.ndarray) -> np.ndarray:
+            position = start + velocity * time[:, None] - [0, 0, GRAVITY / 2] * time[:, None] ** 2
+            return np.linalg.norm(np.maximum(np.abs(position - box[0]) - box[1], 0.0), axis=1) - 0.02
+
+        return gap
+
+    sim = make_sim(count)
+    put(sim, start, velocity)
+    fly_steps(sim, 1)
+    now, inside = np.zeros(count), start[:, 2] > 0.15  # the floor takes no part
+    (gap_table, time_table), (gap_net, time_net) = (first_touch(gap_to(box), count) for box in (table, net))
+    clear = inside & (np.minimum(gap_to(table)(now), gap_to(net)(now)) > 1e-3)
+    events = sim.events
+    seen_table = torch.stack([events.own_bounce_time, events.opponent_bounce_time, events.edge_time]).amin(0).numpy()
+    for seen, least, time, other in (
+        (seen_table, gap_table, time_table, time_net),
+        (events.net_time.numpy(), gap_net, time_net, time_table),
+    ):
+        sure = clear & (np.abs(least) > 2e-4)
+        first = sure & (time < other - 1e-4) & (time < DT - 5e-5)
+        assert first.sum() > 300
+        np.testing.assert_allclose(seen[first], time[first], atol=3e-4)
+        never = sure & np.isinf(time) & np.isinf(other)
+        assert never.sum() > 100
+        assert np.isinf(seen[never]).all()
 
 
 def energy(sim: BallSim) -> Tensor:

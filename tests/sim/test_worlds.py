@@ -122,6 +122,18 @@ def test_the_reaction_acts_where_the_ball_touched() -> None:
     torch.testing.assert_close(worlds._applied[:, 3:6], torque)
 
 
+def test_dropped_contacts_are_warned_of_once() -> None:
+    options = ["engine=mjwarp", "engine.contacts_per_world=2", "engine.constraints_per_world=8"]
+    worlds = make_worlds(1, *options)
+    stand(worlds)
+    worlds.warn_of_overflow()  # nothing yet
+    for _ in range(5):  # it comes down on its feet
+        worlds.step(worlds.nominal.repeat(1, 1))
+    with pytest.warns(RuntimeWarning, match=r"contacts_per_world \(2\).*constraints_per_world \(8\)"):
+        worlds.warn_of_overflow()
+    worlds.warn_of_overflow()
+
+
 def test_state_dict_restores_the_next_step_exactly() -> None:
     config = load_train_config(["engine=native"])
     worlds = Worlds(config, 8, "cpu", torch.Generator().manual_seed(1))
