@@ -90,7 +90,7 @@ def strike_map(rows: Sequence[Row], table: TableConfig) -> Figure:
     _finish(above, side)
     for axes in (above, side):
         axes.set_xlim(*AREA_X)
-    handles, labels = side.get_legend_handles_labels()  # without the net
+    handles, labels = side.get_legend_handles_labels()
     _legend_dots(figure.legend(handles, labels, loc="outside lower center", ncols=3, title=STRIKE_LEGEND))
     return figure
 
@@ -195,7 +195,7 @@ def _draw_table(axes: Axes, table: TableConfig) -> None:
     x, y = 0.5 * table.length, 0.5 * table.width
     axes.fill([-x, x, x, -x], [-y, -y, y, y], color=TABLE_COLOUR, edgecolor="black", linewidth=1.2, zorder=0)
     net = (-y - table.net_overhang, y + table.net_overhang)
-    axes.plot([0, 0], net, color="black", linewidth=2.5, zorder=1, label="net")
+    axes.plot([0, 0], net, color="black", linewidth=2.5, zorder=1)
 
 
 def _legend_dots(legend: Legend) -> None:
