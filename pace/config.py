@@ -475,7 +475,8 @@ class EvaluateConfig:
     out: str | None
     progress: bool
     sweep: bool
-    sweep_serves: int
+    sweep_serves: int  # at least so many a row of a cell
+    sweep_serves_slow: int  # the same for mjwarp on a CPU
     sweep_rows: list[str]
     variations: VariationConfig
     paper: dict[str, PaperRow]
@@ -483,8 +484,9 @@ class EvaluateConfig:
     def __post_init__(self) -> None:
         _require(self.policy in ("run", "zero", "random"), f"policy must be run, zero or random, not {self.policy!r}")
         _require(self.policy != "run" or self.run is not None, "which run? give its folder, or policy=zero|random")
-        _require(len(self.rows) > 0, "rows must name at least one serve range")
-        for name in ("serves", "sweep_serves", "num_worlds"):
+        _require(len(self.rows) > 0 or self.sweep, "rows must name at least one serve range")
+        _require(len(self.sweep_rows) > 0 or not self.sweep, "sweep_rows must name at least one serve range")
+        for name in ("serves", "sweep_serves", "sweep_serves_slow", "num_worlds"):
             _require(getattr(self, name) >= 1, f"{name} must be at least 1, got {getattr(self, name)}")
         _require(self.warmup_serves >= 0, f"warmup_serves must not be negative, got {self.warmup_serves}")
 

@@ -7,6 +7,7 @@ Examples::
     python -m pace.rl.evaluate runs/2026-01-01_pace rows=[mixed] engine=mjwarp out=/tmp/mjwarp
     python -m pace.rl.evaluate policy=random serves=500 physics_dt=0.01   # what chance does
     python -m pace.rl.evaluate runs/2026-01-01_pace --sweep               # and what the policy survives
+    python -m pace.rl.evaluate runs/2026-01-01_pace --sweep rows=[] out=FOLDER   # only that; goes on where it stopped
 
 RUN is a run folder, a checkpoint in one, or ``pretrained/<name>``. The task is rebuilt from what was saved with it.
 """
@@ -14,7 +15,8 @@ RUN is a run folder, a checkpoint in one, or ``pretrained/<name>``. The task is 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,9 +30,19 @@ from pace.rl.evaluation import EvaluationError, Row, evaluate_row
 from pace.rl.evaluation_figures import write_figures
 from pace.rl.evaluation_report import describe, tables, write_report
 from pace.rl.loading import CHANGEABLE, TaskPolicy, built_in_policy, load_policy, override_task
-from pace.rl.progress import SECONDS_PER_LINE
+from pace.rl.progress import SECONDS_PER_LINE, clock
 from pace.rl.run_folder import default_run_dir, versions
-from pace.rl.sweep import Variation, variations, write_sweep
+from pace.rl.sweep import (
+    Cell,
+    Tables,
+    Variation,
+    cells_to_play,
+    engine_name,
+    finished_cells,
+    plan_cell,
+    variations,
+    write_sweep,
+)
 from pace.sim.engine import resolve_device
 
 TASK_PARTS = ("robot", "ball", "engine", "randomization", "sensing")  # what the report says of the task
@@ -51,17 +63,35 @@ def evaluate_from_config(composed: DictConfig) -> None:
     context = circumstances(config, policy, overrides)
     folder = Path(config.out) if config.out else default_run_dir("evaluation")
     print(f"policy {policy.source}\n{describe(context)}", flush=True)
-    rows = evaluate_rows(config, policy, overrides)
+    task = override_task(policy.config, overrides)
+    cells = [plan_cell(change, config, policy, overrides, context["versions"]) for change in changes(config, task)]
+    finished = finished_cells(folder, cells) if cells else {}
+    if config.rows:
+        evaluate_table(config, policy, task, overrides, folder, context)
+    if cells:
+        _announce(run_sweep(config, policy, cells, finished, folder, context))
+
+
+def changes(config: EvaluateConfig, task: TrainConfig) -> list[Variation]:
+    """What the sweep changes, if there is one."""
+    return variations(task, config.variations) if config.sweep else []
+
+
+def evaluate_table(
+    config: EvaluateConfig,
+    policy: TaskPolicy,
+    task: TrainConfig,
+    overrides: Sequence[str],
+    folder: Path,
+    context: Mapping[str, Any],
+) -> None:
+    """Play the rows that ``config`` names, print their table and write it with its figures into ``folder``."""
+    rows = [_with_bar(config, policy, name, name, config.serves, config.num_worlds, overrides) for name in config.rows]
     folder.mkdir(parents=True, exist_ok=True)
     print(f"\n{tables(rows, config.paper)}\n")
-    task = override_task(policy.config, overrides)
     target = task.reward.terms["predicted_landing"].params
     files = write_report(folder, rows, config.paper, context)
-    files += write_figures(folder, rows, task.ball.table, (target["x"], target["y"]))
-    _announce(files)
-    if config.sweep:
-        cells = variations(task, config.variations)
-        _announce(write_sweep(folder, cells, sweep_tables(config, policy, overrides, cells), context))
+    _announce([*files, *write_figures(folder, rows, task.ball.table, (target["x"], target["y"]))])
 
 
 def choose_policy(config: EvaluateConfig) -> TaskPolicy:
@@ -101,41 +131,58 @@ def circumstances(config: EvaluateConfig, policy: TaskPolicy, overrides: Sequenc
     }
 
 
-def engine_name(task: TrainConfig, device_type: str) -> str:
-    """The engine that ``auto`` means on a device."""
-    if task.engine.name != "auto":
-        return task.engine.name
-    return "mjwarp" if device_type == "cuda" else "native"
+def run_sweep(
+    config: EvaluateConfig,
+    policy: TaskPolicy,
+    cells: Sequence[Cell],
+    finished: Tables,
+    folder: Path,
+    context: Mapping[str, Any],
+) -> list[Path]:
+    """Play those ``cells`` that are not ``finished``; the files in ``folder`` are up to date after each.
+
+    A change that changes nothing is not played again. Returns the files.
+    """
+    open_cells = cells_to_play(cells, finished)
+    print(f"\nsweep: {len(cells)} cells, {len(open_cells)} to play; finished ones go to {folder}", flush=True)
+    total, done, started = sum(cell.cost for cell in open_cells), 0.0, time.monotonic()
+    files = write_sweep(folder, cells, finished, context) if not open_cells else []
+    for number, cell in enumerate(open_cells, 1):
+        try:
+            finished[cell.key] = play_cell(config, policy, cell)
+            files = write_sweep(folder, cells, finished, context)
+        except KeyboardInterrupt:
+            print(f"\nto go on: the same command with rows=[] out={folder}", file=sys.stderr)
+            raise
+        done += cell.cost
+        left = clock((time.monotonic() - started) * (total - done) / done)
+        print(f"{number}/{len(open_cells)} | {left} left | {cell_text(cell, finished[cell.key])}", flush=True)
+    return files
 
 
-def evaluate_rows(config: EvaluateConfig, policy: TaskPolicy, overrides: Sequence[str]) -> list[Row]:
-    """The rows that ``config`` names."""
-    return [_with_bar(config, policy, name, name, config.serves, overrides) for name in config.rows]
+def play_cell(config: EvaluateConfig, policy: TaskPolicy, cell: Cell) -> list[dict[str, Any]]:
+    """Summaries of the rows of a cell."""
+    label = cell.variation.label
+    return [
+        _with_bar(config, policy, name, f"{label}, {name}", cell.serves, cell.worlds, cell.overrides).summary
+        for name in config.sweep_rows
+    ]
 
 
-def sweep_tables(
-    config: EvaluateConfig, policy: TaskPolicy, overrides: Sequence[str], cells: Sequence[Variation]
-) -> list[list[dict[str, Any]]]:
-    """Summaries of the rows of each cell; a change that changes nothing is not played again."""
-    device = resolve_device(config.device).type
-    known: dict[str, list[dict[str, Any]]] = {}
-    result: list[list[dict[str, Any]]] = []
-    for cell in cells:
-        changed = [*overrides, *cell.overrides]
-        task = override_task(policy.config, changed)
-        task.engine.name = engine_name(task, device)
-        key = str(task)
-        if key not in known:
-            known[key] = [
-                _with_bar(config, policy, name, f"{cell.label}, {name}", config.sweep_serves, changed).summary
-                for name in config.sweep_rows
-            ]
-        result.append(known[key])
-    return result
+def cell_text(cell: Cell, rows: Sequence[Mapping[str, Any]]) -> str:
+    """A finished cell in a line."""
+    shares = (f"{row['serve']} {100 * row['hit']:.0f}/{100 * row['success']:.0f}" for row in rows)
+    return f"{cell.variation.label}: hit/success % {', '.join(shares)} ({rows[0]['serves']:,} serves a row)"
 
 
 def _with_bar(
-    config: EvaluateConfig, policy: TaskPolicy, serve: str, label: str, serves: int, overrides: Sequence[str]
+    config: EvaluateConfig,
+    policy: TaskPolicy,
+    serve: str,
+    label: str,
+    serves: int,
+    num_worlds: int,
+    overrides: Sequence[str],
 ) -> Row:
     """One row, with a progress bar of its serves."""
     interval = 0.2 if sys.stderr.isatty() else SECONDS_PER_LINE
@@ -145,7 +192,7 @@ def _with_bar(
         def show(counted: int) -> None:
             bar.update(min(counted, serves) - bar.n)
 
-        worlds = min(config.num_worlds, serves)
+        worlds = min(num_worlds, serves)
         return evaluate_row(
             policy, serve, serves, worlds, config.device, config.seed, overrides, config.warmup_serves, show
         )

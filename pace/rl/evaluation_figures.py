@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from pace.config import TableConfig
-from pace.rl.evaluation import C, Row
+from pace.rl.evaluation import PATH_STEPS, C, Row
 from pace.rl.task import Outcome
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
+    from matplotlib.legend import Legend
 
 STRIKES, LANDINGS, FOOTWORK = "strike_map.png", "landing_map.png", "footwork.png"
 #: Serve ranges by speed, m/s, as in the paper's table I: label, fastest and slowest vx, colour.
@@ -31,8 +33,11 @@ LANDING_COLOURS = {
     Outcome.NET: "tab:purple",
     Outcome.OWN_SIDE: "tab:orange",
 }
-AREA_X, AREA_Y, HEIGHTS = (-2.7, -1.1), (-1.15, 1.15), (0.3, 1.8)  # m, the robot's end
-STRIKE_LEGEND = "speed of the serve (successes); hollow: hit without success; black: table"
+AREA_X, AREA_Y, HEIGHTS = (-2.6, -1.2), (-1.15, 1.15), (0.4, 1.6)  # m, the robot's end
+STRIKE_LEGEND = "speed of the serve (successes); hollow: hit without success; light blue, black: table"
+LANDING_X, LANDING_Y = (-1.6, 3.2), (-1.6, 1.6)  # m
+TABLE_COLOUR = "#c9dcec"
+DARK = 42.0  # per cent from the middle of the heat map: black letters cannot be read on it
 DPI = 120
 
 
@@ -63,7 +68,7 @@ def strike_map(rows: Sequence[Row], table: TableConfig) -> Figure:
 
     Figure 5 of the paper; hits without success are hollow.
     """
-    figure = new_figure(11.0, 6.5)
+    figure = new_figure(9.0, 7.9)
     above, side = figure.subplots(1, 2)
     records = all_records(rows)
     speed = column(records, "serve_vx")
@@ -77,20 +82,22 @@ def strike_map(rows: Sequence[Row], table: TableConfig) -> Figure:
             axes.scatter(x[~good], y[~good], s=9, facecolors="none", edgecolors=colour, linewidths=0.4, alpha=0.5)
             axes.scatter(x[good], y[good], s=7, color=colour, alpha=0.5, linewidths=0, label=f"{label} ({successes:,})")
     edge = -0.5 * table.length
-    above.plot([edge, edge], [-0.5 * table.width, 0.5 * table.width], color="black", linewidth=2)
+    _draw_table(above, table)
     side.plot([edge, 0.0], [table.height, table.height], color="black", linewidth=2)
-    above.set(xlabel="x, m", ylabel="y, m (to the robot's left)", title="strike points from above", ylim=AREA_Y)
+    above.set(xlabel="x, m (towards the opponent)", ylabel="y, m (to the robot's left)", ylim=AREA_Y)
+    above.set_title("strike points from above")
     side.set(xlabel="x, m (towards the opponent)", ylabel="z, m", title="from the side", ylim=HEIGHTS)
     _finish(above, side)
     for axes in (above, side):
         axes.set_xlim(*AREA_X)
-    figure.legend(*above.get_legend_handles_labels(), loc="outside lower center", ncols=3, title=STRIKE_LEGEND)
+    handles, labels = side.get_legend_handles_labels()
+    _legend_dots(figure.legend(handles, labels, loc="outside lower center", ncols=3, title=STRIKE_LEGEND))
     return figure
 
 
 def landing_map(rows: Sequence[Row], table: TableConfig, target: tuple[float, float]) -> Figure:
     """Where returns came down, on the table seen from above."""
-    figure = new_figure(9.0, 5.5)
+    figure = new_figure(9.0, 7.3)
     axes = figure.subplots()
     records = all_records(rows)
     _draw_table(axes, table)
@@ -107,56 +114,97 @@ def landing_map(rows: Sequence[Row], table: TableConfig, target: tuple[float, fl
             linewidths=0,
             label=label,
         )
-    axes.plot(*target, marker="+", color="black", markersize=12, linestyle="none", label="target")
-    axes.set(xlabel="x, m", ylabel="y, m", title="landing points of returns", xlim=(-1.6, 3.2), ylim=(-1.6, 1.6))
-    axes.legend(loc="upper right", fontsize="small")
+    axes.plot(*target, marker="+", color="black", markersize=12, linestyle="none", label="target of the reward")
+    axes.set(xlabel="x, m (towards the opponent)", ylabel="y, m (to the robot's left)", xlim=LANDING_X, ylim=LANDING_Y)
+    axes.set_title(f"where returns came down first, table from above ({_beyond(records)} beyond the picture)")
     _finish(axes)
+    _legend_dots(figure.legend(loc="outside lower center", ncols=3))
     return figure
+
+
+def _beyond(records: Tensor) -> int:
+    """Returns that came down outside of the landing map."""
+    shown = torch.tensor([float(outcome) for outcome in LANDING_COLOURS])
+    x, y = column(records, "landing_x"), column(records, "landing_y")
+    outside = (x < LANDING_X[0]) | (x > LANDING_X[1]) | (y < LANDING_Y[0]) | (y > LANDING_Y[1])
+    return int((outside & torch.isin(column(records, "outcome"), shown)).sum())
 
 
 def footwork(rows: Sequence[Row], table: TableConfig) -> Figure:
     """Paths of the base on the floor, some worlds of each row; colour runs with the serves of a world."""
-    from matplotlib import colormaps
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.ticker import MaxNLocator
 
-    figure = new_figure(4.2 * len(rows), 4.6)
-    colours = colormaps["viridis"]
-    for axes, row in zip(figure.subplots(1, len(rows), squeeze=False)[0], rows, strict=True):
-        last = float(row.path[..., 2].nan_to_num(0.0).max())
+    figure = new_figure(1.6 + 2.9 * len(rows), 5.0)
+    last = max(float(row.path[..., 2].nan_to_num(0.0).max()) for row in rows)
+    colours = ScalarMappable(cmap="viridis")
+    colours.set_clim(1.0, max(last, 1.0) + 1.0)
+    panels = figure.subplots(1, len(rows), squeeze=False, sharey=True)[0]
+    for axes, row in zip(panels, rows, strict=True):
         for world in range(row.path.shape[1]):
             path = row.path[:, world]
             for serve in path[:, 2].unique().tolist():
                 piece = path[path[:, 2] == serve]
-                axes.plot(piece[:, 0], piece[:, 1], color=colours(serve / max(last, 1.0)), linewidth=1, alpha=0.8)
-        edge = -0.5 * table.length
-        axes.plot([edge, edge], [-0.5 * table.width, 0.5 * table.width], color="black", linewidth=2)
-        title = f"base, {row.serve.replace('_', '-')}: {row.path.shape[1]} worlds"
-        axes.set(xlabel="x, m", ylabel="y, m", title=title, xlim=AREA_X, ylim=AREA_Y)
+                axes.plot(piece[:, 0], piece[:, 1], color=colours.to_rgba(serve + 1.0), linewidth=1, alpha=0.8)
+        start = row.path[0]
+        axes.plot(start[:, 0], start[:, 1], linestyle="none", marker="o", color="tab:red", markersize=4)
+        _draw_table(axes, table)
+        axes.set(xlabel="x, m", title=f"{row.serve.replace('_', '-')} serves", xlim=AREA_X, ylim=AREA_Y)
         _finish(axes)
+    panels[0].set_ylabel("y, m (to the robot's left)")
+    figure.colorbar(colours, ax=panels, shrink=0.8, label="serve of the world", ticks=MaxNLocator(integer=True))
+    worlds = rows[0].path.shape[1]
+    title = f"paths of the base: {worlds} worlds, {PATH_STEPS} control steps; red: where they begin; blue: table"
+    figure.suptitle(title, fontsize="medium")
     return figure
 
 
-def heat_map(labels: Sequence[str], rows: Sequence[str], values: dict[str, list[list[float]]]) -> Figure:
-    """Shares in per cent: a line for each label, a column for each of ``rows``, a panel for each of ``values``."""
-    figure = new_figure(2.6 + len(values) * (0.8 + 0.85 * len(rows)), 1.3 + 0.3 * len(labels))
-    for axes, (title, table) in zip(
-        figure.subplots(1, len(values), sharey=True, squeeze=False)[0], values.items(), strict=True
-    ):
-        per_cent = [[100.0 * value for value in line] for line in table]
-        image = axes.imshow(per_cent, vmin=0, vmax=100, cmap="RdYlGn", aspect="auto")
-        for y, line in enumerate(per_cent):
-            for x, value in enumerate(line):
-                axes.text(x, y, f"{value:.0f}", ha="center", va="center", fontsize="small")
-        axes.set_title(f"{title}, %")
-        axes.set_xticks(range(len(rows)), [name.replace("_", "-") for name in rows], rotation=30, ha="right")
-        axes.set_yticks(range(len(labels)), labels)
-        figure.colorbar(image, ax=axes, shrink=0.6)
+def heat_map(labels: Sequence[tuple[str, str]], tables: Sequence[Sequence[Mapping[str, Any]]], title: str) -> Figure:
+    """Hits and successes in per cent, with half of their 95 % interval: a line for each label (kind of change, text), a
+    column for each serve range. ``tables`` holds the summaries of the rows of each line."""
+    names = [row["serve"].replace("_", "-") for row in tables[0]]
+    figure = new_figure(3.4 + 1.7 * len(names), 1.9 + 0.28 * len(labels))
+    panels = figure.subplots(1, 2, sharey=True, squeeze=False)[0]
+    breaks = [y - 0.5 for y in range(1, len(labels)) if labels[y][0] != labels[y - 1][0]]
+    images = [_heat_panel(axes, share, tables) for axes, share in zip(panels, ("hit", "success"), strict=True)]
+    for axes in panels:
+        axes.hlines(breaks, -0.5, len(names) - 0.5, color="white", linewidth=3)
+        axes.set(xlabel="range of the serves", xticks=range(len(names)), xticklabels=names)
+        axes.set_yticks(range(len(labels)), [text for _, text in labels])
+        axes.tick_params(length=0)
+    figure.colorbar(images[0], ax=panels, shrink=0.8, label="% of serves")
+    figure.suptitle(f"{title}\n± half of the 95 % interval", fontsize="medium")
     return figure
+
+
+def _heat_panel(axes: Axes, share: str, tables: Sequence[Sequence[Mapping[str, Any]]]) -> AxesImage:
+    """One share of all cells, with half of its interval."""
+    per_cent = [[100.0 * row[share] for row in rows] for rows in tables]
+    image = axes.imshow(per_cent, vmin=0, vmax=100, cmap="RdYlGn", aspect="auto")
+    for y, rows in enumerate(tables):
+        for x, row in enumerate(rows):
+            text = f"{per_cent[y][x]:.0f} ±{50 * (row[f'{share}_high'] - row[f'{share}_low']):.0f}"
+            colour = "white" if abs(per_cent[y][x] - 50.0) > DARK else "black"
+            axes.text(x, y, text, ha="center", va="center", fontsize="small", color=colour)
+    axes.set_title(f"{share}, % of serves")
+    return image
 
 
 def _draw_table(axes: Axes, table: TableConfig) -> None:
+    """The table from above, to scale, with its net."""
     x, y = 0.5 * table.length, 0.5 * table.width
-    axes.plot([-x, x, x, -x, -x], [-y, -y, y, y, -y], color="black", linewidth=1.5)
-    axes.plot([0, 0], [-y - table.net_overhang, y + table.net_overhang], color="black", linewidth=2.5)
+    axes.fill([-x, x, x, -x], [-y, -y, y, y], color=TABLE_COLOUR, edgecolor="black", linewidth=1.2, zorder=0)
+    net = (-y - table.net_overhang, y + table.net_overhang)
+    axes.plot([0, 0], net, color="black", linewidth=2.5, zorder=1)
+
+
+def _legend_dots(legend: Legend) -> None:
+    """Dots of a legend large and opaque, whatever they are in the panel."""
+    from matplotlib.collections import PathCollection
+
+    for handle in legend.legend_handles:
+        if isinstance(handle, PathCollection):
+            handle.set(sizes=[30.0], alpha=1.0)
 
 
 def _finish(*panels: Axes) -> None:

@@ -2,16 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+import json
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pace.config import RandomizationConfig, SensingConfig, TrainConfig, VariationConfig, config_dir
+from pace.config import (
+    EvaluateConfig,
+    RandomizationConfig,
+    SensingConfig,
+    TrainConfig,
+    VariationConfig,
+    config_dir,
+    to_dict,
+)
+from pace.rl.evaluation import EvaluationError
 from pace.rl.evaluation_figures import DPI, heat_map
 from pace.rl.evaluation_report import write_json
+from pace.rl.loading import TaskPolicy, override_task
+from pace.sim.engine import resolve_device
 
 JSON, MAP = "sweep.json", "sweep.png"
+SERVES_PER_WORLD = 4  # counted, in a cell: more waste less on those that are not, and fill the cores less
+SLOWNESS = 10.0  # times that mjwarp takes on a CPU (docs/speed.md), for the time that is left
+Tables = dict[str, list[dict[str, Any]]]  # summaries of a cell's rows, by its key
+LABELS = {"noise": "sensing noise", "trunk_mass": "trunk mass", "gain": "joint gains"}
 NOISE = tuple(name for name in SensingConfig.__dataclass_fields__ if name not in ("name", "mocap_delay"))
 
 
@@ -26,7 +44,7 @@ class Variation:
     @property
     def label(self) -> str:
         """As it stands in the heat map."""
-        return f"{self.kind.replace('_', ' ')} {self.value}".strip()
+        return f"{LABELS.get(self.kind, self.kind)} {self.value}".strip()
 
 
 def ball_presets() -> list[str]:
@@ -45,7 +63,7 @@ def variations(task: TrainConfig, chosen: VariationConfig) -> list[Variation]:
         cells.append(Variation("noise", f"x {times:g}", louder))
     for extra in chosen.latency:
         later = _range("sensing.mocap_delay", [delay + extra for delay in sensing.mocap_delay])
-        cells.append(Variation("latency", f"+ {1000 * extra:g} ms", (later,)))
+        cells.append(Variation("latency", f"+{1000 * extra:g} ms", (later,)))
     cells += [_shift(bodies, "friction", offset, "", lowest=0.05) for offset in chosen.friction]
     cells += [_shift(bodies, "trunk_mass", offset, " kg") for offset in chosen.trunk_mass]
     for times in chosen.gain:
@@ -67,17 +85,101 @@ def _range(key: str, bounds: Sequence[float]) -> str:
     return f"{key}=[{bounds[0]:.6g},{bounds[1]:.6g}]"
 
 
-def write_sweep(
-    folder: Path, cells: Sequence[Variation], tables: Sequence[Sequence[dict[str, Any]]], context: dict[str, Any]
-) -> list[Path]:
-    """``sweep.json`` and the heat map in ``folder``; ``tables`` holds the summaries of the rows of each cell."""
-    entries = [
-        {"kind": cell.kind, "value": cell.value, "overrides": list(cell.overrides), "rows": list(rows)}
-        for cell, rows in zip(cells, tables, strict=True)
-    ]
+@dataclass(frozen=True)
+class Cell:
+    """A variation as it is played: the overrides of the saved task, serves a row and worlds, and the time that it takes
+    in serves of the fast engine.
+
+    ``key`` tells what its figures depend on: cells of one key are played once, and found again in a sweep's file.
+    """
+
+    variation: Variation
+    overrides: tuple[str, ...]
+    serves: int
+    worlds: int
+    cost: float
+    key: str
+
+
+def engine_name(task: TrainConfig, device_type: str) -> str:
+    """The engine that ``auto`` means on a device."""
+    if task.engine.name != "auto":
+        return task.engine.name
+    return "mjwarp" if device_type == "cuda" else "native"
+
+
+def plan_cell(
+    variation: Variation, config: EvaluateConfig, policy: TaskPolicy, overrides: Sequence[str], program: Any
+) -> Cell:
+    """How ``variation`` of the task of ``policy`` with ``overrides`` is played.
+
+    An engine that is slow on the device plays ``sweep_serves_slow``. ``program``: versions of what computes it.
+    """
+    device = resolve_device(config.device)
+    changed = (*overrides, *variation.overrides)
+    task = override_task(policy.config, changed)
+    task.engine.name = engine_name(task, device.type)
+    slow = task.engine.name == "mjwarp" and device.type == "cpu"
+    serves = config.sweep_serves_slow if slow else config.sweep_serves
+    worlds = min(config.num_worlds, math.ceil(serves / SERVES_PER_WORLD))
+    played = worlds * (config.warmup_serves + math.ceil(serves / worlds)) * len(config.sweep_rows)
+    depends = [policy.source, dict(policy.counters), config.seed, config.warmup_serves, config.sweep_rows, serves]
+    text = json.dumps([*depends, worlds, str(device), program, to_dict(task)], sort_keys=True)
+    key = hashlib.sha256(text.encode()).hexdigest()[:16]
+    return Cell(variation, changed, serves, worlds, played * (SLOWNESS if slow else 1.0), key)
+
+
+def finished_cells(folder: Path, cells: Sequence[Cell]) -> Tables:
+    """Rows of those ``cells`` that a sweep in ``folder`` has finished, by key; empty where there was none.
+
+    Errors: :class:`EvaluationError` for a ``sweep.json`` that is not one, or has cells of another sweep to lose.
+    """
+    file = folder / JSON
+    if not file.exists():
+        return {}
+    try:
+        tables = {cell["key"]: cell["rows"] for cell in json.loads(file.read_text())["cells"]}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise EvaluationError(f"{file} is no file of a sweep ({error!r}): give another out=") from error
+    if not set(tables) <= {cell.key for cell in cells}:
+        raise EvaluationError(
+            f"{file} is of a sweep with another policy, settings or version of pace: give another out="
+        )
+    return tables
+
+
+def cells_to_play(cells: Sequence[Cell], finished: Tables) -> list[Cell]:
+    """Those ``cells`` that are not ``finished``, one of each key, the slow ones last."""
+    first: dict[str, Cell] = {}
+    for cell in cells:
+        if cell.key not in finished:
+            first.setdefault(cell.key, cell)
+    return sorted(first.values(), key=lambda cell: cell.cost)
+
+
+def write_sweep(folder: Path, cells: Sequence[Cell], tables: Tables, context: Mapping[str, Any]) -> list[Path]:
+    """``sweep.json`` and the heat map in ``folder``, of those ``cells`` that ``tables`` has the rows of.
+
+    Each file is written under another name first, so that an interruption leaves the last one whole.
+    """
+    done = [cell for cell in cells if cell.key in tables]
+    entries = [_entry(cell, tables[cell.key]) for cell in done]
     files = [folder / JSON, folder / MAP]
-    write_json(files[0], {"cells": entries, **context})
-    values = {name: [[row[name] for row in rows] for rows in tables] for name in ("hit", "success")}
-    names = [row["serve"] for row in tables[0]]
-    heat_map([cell.label for cell in cells], names, values).savefig(files[1], dpi=DPI)
+    folder.mkdir(parents=True, exist_ok=True)
+    parts = [file.with_name(f"part_{file.name}") for file in files]
+    write_json(parts[0], {"cells": entries, **context})
+    figure = heat_map(
+        [(cell.variation.kind, cell.variation.label) for cell in done],
+        [tables[cell.key] for cell in done],
+        f"{context['policy']}: one change at a time; engine {context['engine']} unless changed",
+    )
+    figure.savefig(parts[1], dpi=DPI)
+    for part, file in zip(parts, files, strict=True):
+        part.replace(file)
     return files
+
+
+def _entry(cell: Cell, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    own = cell.variation
+    change = {"kind": own.kind, "value": own.value, "overrides": list(own.overrides)}
+    return {**change, "num_worlds": cell.worlds, "key": cell.key, "rows": list(rows)}

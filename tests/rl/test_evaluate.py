@@ -19,7 +19,7 @@ from pace.rl import evaluate
 from pace.rl.evaluation import COLUMNS, C, ServeRecorder, count_failures, evaluate_row, summarise, wilson
 from pace.rl.evaluation_report import clean, text_table
 from pace.rl.loading import built_in_policy, load_policy, override_task
-from pace.rl.sweep import ball_presets, variations
+from pace.rl.sweep import Variation, ball_presets, plan_cell, variations
 from pace.rl.task import Outcome
 
 QUICK = ["engine.physics_dt=0.02", "engine=native", "serve.max_duration=0.9"]
@@ -235,6 +235,7 @@ def check_files(out: Path, run: Path) -> None:
         (("policy=zero", "rows=[lob]"), 2, "lob"),
         (("policy=zero", "ball=wood"), 2, "wood"),
         (("policy=zero", "serves=0"), 2, "serves must be at least 1"),
+        (("policy=zero", "rows=[]"), 2, "at least one serve range"),
         (("policy=zero", "physics_dt=0.003"), 2, "must divide"),
         (("policy=zero", "speed=3"), 2, "speed"),
     ],
@@ -270,6 +271,71 @@ def test_the_sweep_changes_one_thing_at_a_time() -> None:
     weak = override_task(task, kinds["gain"][0].overrides).randomization
     assert weak.kp_scale == pytest.approx([0.8 * value for value in bodies.kp_scale])
     assert weak.friction == bodies.friction
+
+
+SWEEP = ["--sweep", "rows=[]", "sweep_rows=[short]", "sweep_serves=2", "warmup_serves=0", "physics_dt=0.02"]
+SWEEP += ["progress=false", "serve.max_duration=0.9", "device=cpu", "variations.ball=[venue]", "variations.engine=[]"]
+SWEEP += [f"variations.{name}=[]" for name in ("noise", "latency", "friction", "trunk_mass")]
+
+
+def fake_row(serves: int) -> SimpleNamespace:
+    """What a sweep reads of a row."""
+    return SimpleNamespace(summary=summarise("short", records([Outcome.SUCCESS] * serves), (1.15, 0.0), 0.9))
+
+
+def test_an_interrupted_sweep_keeps_its_cells_and_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    played: list[str] = []
+
+    def play(*arguments: object) -> SimpleNamespace:
+        if len(played) == 2:
+            raise KeyboardInterrupt
+        played.append(str(arguments[6]))
+        return fake_row(2)
+
+    monkeypatch.setattr(evaluate, "evaluate_row", play)
+    command = ["policy=zero", f"out={tmp_path}", *SWEEP, "variations.gain=[0.8,1.0,1.2]"]
+    assert run_main(monkeypatch, *command) == 130
+    printed = capsys.readouterr()
+    assert f"rows=[] out={tmp_path}" in printed.err
+    assert "2/4 | " in printed.out  # x 1 is the task as given
+    assert " left | ball venue: hit/success % short 100/100 (2 serves a row)" in printed.out
+    kept = json.loads((tmp_path / "sweep.json").read_text())["cells"]
+    assert [cell["kind"] for cell in kept] == ["as given", "ball", "gain"]
+    played[:1] = []  # one more may be played, then the next interruption
+    assert run_main(monkeypatch, *command) == 130
+    assert "kp_scale" in played[1]
+    assert len(json.loads((tmp_path / "sweep.json").read_text())["cells"]) == 4
+    capsys.readouterr()
+    assert run_main(monkeypatch, *command, "seed=2") == 1  # would have other figures
+    assert "give another out=" in capsys.readouterr().err
+    played.pop()
+    assert run_main(monkeypatch, *command) == 0
+    assert run_main(monkeypatch, *command) == 0  # nothing left to play
+    assert "5 cells, 0 to play" in capsys.readouterr().out
+    assert len(json.loads((tmp_path / "sweep.json").read_text())["cells"]) == 5
+
+
+def test_a_file_that_is_no_sweep_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "sweep.json").write_text("[1]")
+    assert run_main(monkeypatch, "policy=zero", f"out={tmp_path}", *SWEEP, "variations.gain=[]") == 1
+    assert "sweep.json is no file of a sweep" in capsys.readouterr().err
+    assert (tmp_path / "sweep.json").read_text() == "[1]"
+
+
+def test_a_slow_engine_plays_fewer_serves_and_costs_more() -> None:
+    config = parse(compose("evaluate", ["policy=zero", "device=cpu"]), EvaluateConfig)
+    policy = built_in_policy("zero", 1)
+    given, native, warp = (
+        plan_cell(Variation("engine", name, (f"engine={name}",)), config, policy, (), {})
+        for name in ("auto", "native", "mjwarp")
+    )
+    assert (native.serves, native.worlds, native.cost) == (500, 125, 4 * 125 * 6)
+    assert (warp.serves, warp.worlds, warp.cost) == (100, 25, 10 * 4 * 25 * 6)
+    assert given.key == native.key != warp.key
 
 
 def test_the_run_may_stand_anywhere_and_hold_any_sign(tmp_path: Path) -> None:
