@@ -15,6 +15,7 @@ from torch import Tensor
 
 from pace.config import ConfigError, RewardConfig
 from pace.rl.state import TaskState
+from pace.sim.aero import GRAVITY
 
 Params = Mapping[str, float]
 Term = Callable[[TaskState, Params], Tensor]
@@ -113,6 +114,22 @@ def predicted_net_height(state: TaskState, params: Params) -> Tensor:
     paid = state.game.referee.hit_now & height.isfinite()
     error = (torch.where(paid, height, 0.0) - params["z"]).abs()
     return torch.exp(error * (-1.0 / params["sigma"])) * paid
+
+
+@term("x", "y", "z", "time", "sigma")
+def return_velocity(state: TaskState, params: Params) -> Tensor:
+    """Once, at the hit: exp(-e / sigma), e how far the ball's velocity, m/s, is from a good return's.
+
+    That one would carry it from where it was hit to (x, y, z), m, in ``time`` s, without air. Between a ball that drops
+    on the own half and one that clears the net lie those in the net, which have neither a landing nor a height there:
+    this term leads across.
+    """
+    events = state.ball.events
+    lifted = params["z"] + 0.5 * GRAVITY * params["time"] ** 2
+    error = events.hit_velocity_out + events.hit_position / params["time"]
+    for axis, aim in enumerate((params["x"], params["y"], lifted)):
+        error[:, axis] -= aim / params["time"]
+    return torch.exp(_length(error) * (-1.0 / params["sigma"])) * state.game.referee.hit_now
 
 
 @term("at_hit")

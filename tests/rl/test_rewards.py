@@ -42,7 +42,7 @@ def play(state: TaskState, distance: float, **times: Any) -> None:
 
 def test_every_term_of_the_paper_is_there_and_every_term_is_tested() -> None:
     assert set(PACE.terms) == set(TERMS)
-    assert set(PACE.terms) - set(PAPER.terms) == {"arrival"}
+    assert set(PACE.terms) - set(PAPER.terms) == {"arrival", "return_velocity"}
 
 
 def test_paddle_to_target() -> None:
@@ -120,6 +120,22 @@ def test_predicted_landing() -> None:
     assert value("predicted_landing", state) == 0.0  # once
 
 
+def test_return_velocity() -> None:
+    state = fake_state()
+    hit(state)
+    events = state.ball.events
+    events.hit_position[:] = torch.tensor([-1.5, 0.2, 1.03])
+    flight, aim, gravity = 0.5, torch.tensor([1.5, 0.0, 0.78]), torch.tensor([0.0, 0.0, -9.81])
+    good = (aim - events.hit_position[0] - 0.5 * gravity * flight**2) / flight
+    assert torch.allclose(good, torch.tensor([6.0, -0.4, 1.9525]))
+    events.hit_velocity_out[:] = good
+    assert value("return_velocity", state, PACE) == pytest.approx(1.0, abs=1e-6)
+    events.hit_velocity_out[:] = good + torch.tensor([-2.0, 1.0, -2.0])  # 3 m/s off
+    assert value("return_velocity", state, PACE) == pytest.approx(math.exp(-1.0), rel=1e-5)
+    play(state, 0.5)
+    assert value("return_velocity", state, PACE) == 0.0  # once
+
+
 def test_predicted_net_height() -> None:
     state = fake_state()
     hit(state)
@@ -138,7 +154,8 @@ def test_illegal_hits_pay_neither_landing_nor_net_nor_success() -> None:
     play(state, 0.0275, paddle_hit=0.01)
     for name in ("predicted_landing", "predicted_net_height", "success"):
         assert value(name, state) == 0.0
-    assert value("success", state, PACE) == 0.0
+    for name in ("return_velocity", "success"):
+        assert value(name, state, PACE) == 0.0
 
 
 def test_success_when_it_lands_or_at_the_hit() -> None:
