@@ -267,7 +267,7 @@ class EngineConfig:
     constraints_per_world: int  # mjwarp: room for constraint rows
     paddle_reaction: bool  # the ball's impulse acts on the paddle over the next control step
     ball_dt: float  # s, longest sub-step of the ball's flight
-    graph: str = "auto"  # steps and resets as CUDA graphs: auto (on a GPU), always, never
+    graph: str = "auto"  # of CUDA for steps and resets on a GPU, of Warp for mjwarp on a CPU: auto, always, never
 
     def __post_init__(self) -> None:
         _require(self.name in ("auto", "native", "mjwarp"), f"engine must be auto, native or mjwarp, not {self.name!r}")

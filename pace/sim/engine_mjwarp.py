@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pace.config import EngineConfig
 from pace.sim.engine import ModelFields, StateTensors
-from pace.sim.graph import CapturedCall, graphs_wanted
+from pace.sim.graph import CapturedCall, RecordedLaunches, graphs_wanted
 from pace.sim.sharing import warp_scope
 
 #: Overflows that drop contacts or constraints. The solver's iteration limits, which share the bit mask, do not.
@@ -49,8 +49,8 @@ class MjwarpEngine(StateTensors):
     """MuJoCo Warp in float32. See :class:`~pace.sim.engine.RobotEngine`.
 
     On a GPU one control step is one CUDA graph, or a part of the environment's (:class:`~pace.sim.graph.CapturedCall`).
-    The graph holds the addresses of the arrays and the options of the second step: edit values in place, and replace
-    no array of ``model`` or ``data`` and no option after it.
+    On a CPU its launches are recorded (:class:`~pace.sim.graph.RecordedLaunches`). Both hold the addresses of the
+    arrays and the options of the second step: edit values in place, and replace no array of ``model`` or ``data``.
     """
 
     def __init__(
@@ -76,7 +76,10 @@ class MjwarpEngine(StateTensors):
         self._targets = torch.zeros(num_worlds, substeps, model.nu, device=device)
         self._warp_targets = wp.from_torch(self._targets)
         self._warp_path = [wp.from_torch(self.qpos_path), wp.from_torch(self.qvel_path)]
-        self._step = CapturedCall(self._play, device, graphs_wanted(engine, device))
+        if device.type == "cuda":
+            self._step = CapturedCall(self._play, device, graphs_wanted(engine, device))
+        else:
+            self._step = RecordedLaunches(self._play, engine.graph != "never")
         self._qpos.copy_(self.qpos_path[:, 0])
 
     def advance(self, targets: Tensor, applied: Tensor) -> None:

@@ -1,4 +1,4 @@
-"""A part of the hot path as one CUDA graph, torch's and Warp's work together; on a CPU the function itself."""
+"""Work that is the same in every step, launched as one: CUDA graphs on a GPU, Warp's own on its CPU device."""
 
 from __future__ import annotations
 
@@ -63,7 +63,8 @@ class CapturedCall:
             for own, value in zip(self._inputs, values, strict=True):
                 own.copy_(value)
             if self._graph is None:
-                self._graph = self._capture(self._inputs)
+                with _as_one():
+                    self._graph = self._capture(self._inputs)
             self._graph.replay()
 
     def _capture(self, inputs: tuple[Tensor, ...]) -> torch.cuda.CUDAGraph:
@@ -79,13 +80,36 @@ class CapturedCall:
                 wp.ScopedStream(warp_side),
                 torch.cuda.graph(graph, stream=side, capture_error_mode="thread_local"),
                 wp.ScopedCapture(stream=warp_side, external=True) as capture,
-                _as_one(),
             ):
                 self._function(*inputs)
         except RuntimeError as error:
             raise RuntimeError(f"no CUDA graph of {self._function}; engine.graph=never does without") from error
         self._warp_graph = capture.graph
         return graph
+
+
+class RecordedLaunches:
+    """Launches on Warp's CPU device, repeated in C++ where ``enabled``: Python costs as much as 256 robots do.
+
+    As with :class:`CapturedCall` the first call runs the function, the second records it, and it must do the same each
+    time; here it launches kernels of Warp and does nothing else. A loop that ends on a condition stays one.
+    """
+
+    def __init__(self, function: Callable[[], None], enabled: bool) -> None:
+        self._function, self._enabled = function, enabled
+        self._compiled = False
+        self._graph: wp.Graph | None = None
+
+    def __call__(self) -> None:
+        if not self._enabled or CapturedCall._running or not self._compiled:
+            self._function()
+            self._compiled = True
+            return
+        if self._graph is None:
+            with wp.ScopedCapture(device="cpu") as capture:  # records, and runs nothing
+                self._function()
+            self._graph = capture.graph
+        wp.capture_launch(self._graph)
 
 
 @contextmanager
