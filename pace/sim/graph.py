@@ -89,7 +89,7 @@ class CapturedCall:
 
 
 class RecordedLaunches:
-    """Launches on Warp's CPU device, repeated in C++ where ``enabled``: Python costs as much as 256 robots do.
+    """Launches on Warp's CPU device, repeated in C++ where ``enabled``: Python is a quarter of a step of 256 robots.
 
     As with :class:`CapturedCall` the first call runs the function, the second records it, and it must do the same each
     time; here it launches kernels of Warp and does nothing else. A loop that ends on a condition stays one.
