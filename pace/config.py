@@ -267,10 +267,14 @@ class EngineConfig:
     constraints_per_world: int  # mjwarp: room for constraint rows
     paddle_reaction: bool  # the ball's impulse acts on the paddle over the next control step
     ball_dt: float  # s, longest sub-step of the ball's flight
+    graph: str = "auto"  # of CUDA for steps and resets on a GPU, of Warp for mjwarp on a CPU: auto, always, never
 
     def __post_init__(self) -> None:
         _require(self.name in ("auto", "native", "mjwarp"), f"engine must be auto, native or mjwarp, not {self.name!r}")
         _require(self.physics_dt > 0, "engine.physics_dt must be positive")
+        _require(
+            self.graph in ("auto", "always", "never"), f"engine.graph must be auto, always or never, not {self.graph!r}"
+        )
         _require(self.cone in ("pyramidal", "elliptic"), "engine.cone must be pyramidal or elliptic")
         _require(self.threads >= 0, "engine.threads must be 0 (all cores) or more")
         for name in ("solver_iterations", "line_search_iterations", "contacts_per_world", "constraints_per_world"):

@@ -26,6 +26,7 @@ from pace.rl.rewards import RewardManager
 from pace.rl.state import TaskState
 from pace.rl.statistics import Statistics
 from pace.rl.task import Game, PoseSampler, ServeSampler
+from pace.sim.graph import CapturedCall, graphs_wanted
 from pace.sim.sensing import Sensing
 from pace.sim.snapshot import restore, snapshot, under_prefix, with_prefix
 from pace.sim.worlds import Worlds
@@ -48,6 +49,9 @@ class TableTennisEnv(EnvBase):
     ``predictor_valid`` (N,) bool, ``predictor_time_to_apex`` (N,) s; for evaluation ``serve_over`` (N,) bool,
     ``serve_outcome`` (N,) int (:class:`pace.rl.task.Outcome`) and ``serve_hit`` (N,) bool of the serves that ended in
     this step. ``warmup_serves``: so many first serves of each world are left out of the statistics.
+
+    On a GPU a step and a reset are a CUDA graph each (:class:`pace.sim.graph.CapturedCall`; ``engine.graph``): the
+    configuration and the predictor's tensors are those of the second step, and are changed in place or not at all.
 
     Args:
         config: the task.
@@ -81,6 +85,7 @@ class TableTennisEnv(EnvBase):
         self._build(predictor)
         self._allocate()
         self._make_specs()
+        self._capture()
         self.reset_worlds(self._everyone)
 
     def _build(self, predictor: Predictor | None) -> None:
@@ -122,15 +127,23 @@ class TableTennisEnv(EnvBase):
         self.terminated, self.truncated = ends.lost, ends.truncated
         self.serve_over, self.serve_outcome, self.serve_hit = ends.over, ends.outcome, ends.hit
         self._bad = torch.zeros_like(self._everyone)
+        self.first_counted_serve, self._warmup_serves = torch.zeros((), device=device), 0
+
+    def _capture(self) -> None:
+        device = self.worlds.device
+        enabled = graphs_wanted(self.config.engine, device)
+        self._step_in_place = CapturedCall(self._advance, device, enabled, self.generator)
+        self._reset_in_place = CapturedCall(self._begin_episodes, device, enabled, self.generator)
 
     @property
     def warmup_serves(self) -> int:
         """So many first serves of each world are left out of the statistics."""
-        return self.statistics.warmup_serves
+        return self._warmup_serves
 
     @warmup_serves.setter
     def warmup_serves(self, count: int) -> None:
-        self.statistics.warmup_serves = count
+        self._warmup_serves = count
+        self.first_counted_serve.fill_(count)
 
     # --- in place -----------------------------------------------------------------------------------------------------
 
@@ -146,6 +159,9 @@ class TableTennisEnv(EnvBase):
         is what would have come next. (6) Sensors, predictor, observations. Nothing is reset here: the observations
         of worlds that are done are their last ones, until :meth:`reset_worlds`.
         """
+        self._step_in_place(action)
+
+    def _advance(self, action: Tensor) -> None:
         self._move(action)
         self._judge()
         self.task_state.refresh()
@@ -170,6 +186,9 @@ class TableTennisEnv(EnvBase):
         """
         if self.worlds.device.type == "cpu" and not bool(mask.any()):
             return
+        self._reset_in_place(mask)
+
+    def _begin_episodes(self, mask: Tensor) -> None:
         qpos, qvel = self._poses.sample(self.num_worlds)
         self.worlds.reset_robot(mask, qpos, qvel)
         self.game.clock.start_episode(mask, self.generator)

@@ -32,11 +32,10 @@ class Statistics:
 
     ``serves`` that ended, without ``bad_serves``; ``hits``, ``rim_hits`` and ``successes`` among them; their
     ``outcome/<name>``; ``falls`` (or area left), ``episodes`` that ended, ``steps`` of all worlds. Serves are counted
-    at their end, and not while a world plays its first ``warmup_serves``.
+    at their end, and not while a world plays its first ``env.warmup_serves``.
     """
 
     def __init__(self, num_worlds: int, device: torch.device) -> None:
-        self.warmup_serves = 0
         self.sums = torch.zeros(len(NAMES), device=device)
         self._codes = torch.tensor([int(outcome) for outcome in COUNTED], device=device).unsqueeze(-1)
         self._one_step = torch.ones(num_worlds, dtype=torch.bool, device=device)
@@ -44,7 +43,7 @@ class Statistics:
     def add(self, env: TableTennisEnv) -> None:
         """Count the step that ``env`` just made."""
         referee = env.game.referee
-        ended = env.serve_over & (env.game.clock.played >= self.warmup_serves)
+        ended = env.serve_over & (env.game.clock.played >= env.first_counted_serve)
         bad = env.serve_outcome == Outcome.BAD_SERVE
         counted = ended & ~bad
         hit = counted & referee.hit

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from pace.config import ConfigError, EngineConfig
+from pace.sim.graph import graphs_wanted
 from pace.sim.robot import FEET, TRUNK_BODY
 
 
@@ -212,9 +213,10 @@ def make_engine(
     """N worlds of ``model`` on ``device``. Engine ``auto`` is mjwarp on a GPU and native on the CPU.
 
     Args: substeps: physics steps of one control step. The worlds stand in the model's nominal keyframe.
-    Errors: :class:`ConfigError` for a device that is not there, or that the engine cannot use.
+    Errors: :class:`ConfigError` for a device that is not there, or that the engine or CUDA graphs cannot use.
     """
     where = resolve_device(device)
+    graphs_wanted(engine, where)
     name = engine.name if engine.name != "auto" else ("mjwarp" if where.type == "cuda" else "native")
     if name == "native":
         from pace.sim.engine_native import NativeEngine

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import mujoco
 import mujoco_warp as mjw
 import torch
@@ -12,7 +10,8 @@ from torch import Tensor
 
 from pace.config import EngineConfig
 from pace.sim.engine import ModelFields, StateTensors
-from pace.sim.sharing import torch_stream
+from pace.sim.graph import CapturedCall, RecordedLaunches, graphs_wanted
+from pace.sim.sharing import warp_scope
 
 #: Overflows that drop contacts or constraints. The solver's iteration limits, which share the bit mask, do not.
 _DROPPED = (
@@ -49,21 +48,22 @@ def _record_state(
 class MjwarpEngine(StateTensors):
     """MuJoCo Warp in float32. See :class:`~pace.sim.engine.RobotEngine`.
 
-    On a GPU one control step is one CUDA graph, captured at the first ``advance`` and launched on torch's current
-    stream. The graph holds the addresses of the arrays and the options of that moment. Values are edited in place
-    without a new capture; after replacing an array of ``model`` or ``data``, or an option, set ``graph`` to None, and
-    the next step captures anew. The solver's loop ends on the device: a conditional node of the graph.
+    On a GPU one control step is one CUDA graph, or a part of the environment's (:class:`~pace.sim.graph.CapturedCall`).
+    On a CPU its launches are recorded (:class:`~pace.sim.graph.RecordedLaunches`). Both hold the addresses of the
+    arrays and the options of the second step: edit values in place, and replace no array of ``model`` or ``data``.
     """
 
     def __init__(
         self, model: mujoco.MjModel, engine: EngineConfig, num_worlds: int, device: torch.device, substeps: int
     ) -> None:
         super().__init__(model, num_worlds, device, substeps, engine.physics_dt)
-        self._warp_device = wp.device_from_torch(device)
         self._fields = ModelFields(model, device)
-        with wp.ScopedDevice(self._warp_device):
+        with warp_scope(device):
             self.model = mjw.put_model(model, batch_sizes=dict.fromkeys(ModelFields.NAMES, num_worlds))
             self.model.opt.warn_overflow = 0  # a line a world a step; overflowed() tells
+            # On a GPU all iterations are launched, and converged worlds skip theirs: a loop that ends on the device
+            # would interrupt the capture around it, after which torch no longer knows what memory is the graph's.
+            self.model.opt.graph_conditional = device.type == "cpu"
             self.data = mjw.make_data(
                 model, num_worlds, nconmax=engine.contacts_per_world, njmax=engine.constraints_per_world
             )
@@ -76,35 +76,22 @@ class MjwarpEngine(StateTensors):
         self._targets = torch.zeros(num_worlds, substeps, model.nu, device=device)
         self._warp_targets = wp.from_torch(self._targets)
         self._warp_path = [wp.from_torch(self.qpos_path), wp.from_torch(self.qvel_path)]
-        self.graph: Any = None
+        if device.type == "cuda":
+            self._step = CapturedCall(self._play, device, graphs_wanted(engine, device))
+        else:
+            self._step = RecordedLaunches(self._play, engine.graph != "never")
         self._qpos.copy_(self.qpos_path[:, 0])
 
     def advance(self, targets: Tensor, applied: Tensor) -> None:
         self._targets.copy_(targets)
         self._applied.copy_(applied)
-        if self._warp_device.is_cuda:
-            if self.graph is None:
-                self._capture()
-            wp.capture_launch(self.graph, stream=torch_stream(self.device))
-        else:
-            self._play()
+        self._step()
         self._read_sensors(self._sensordata, self._actuator_force)
-
-    def _capture(self) -> None:
-        """Make the graph, once. On Warp's own stream, for torch's default stream cannot be captured."""
-        saved = {name: value.clone() for name, value in self.state_dict().items()}
-        wp.synchronize_device(self._warp_device)
-        self._play()  # compiles its kernels, which may fail inside a capture
-        wp.synchronize_device(self._warp_device)
-        self.load_state_dict(saved)
-        with wp.ScopedDevice(self._warp_device), wp.ScopedCapture() as capture:
-            self._play()
-        self.graph = capture.graph
 
     def _play(self) -> None:
         """The launches of one control step."""
-        self._record(0)
-        with wp.ScopedDevice(self._warp_device):
+        with warp_scope(self.device):
+            self._record(0)
             for step in range(self.substeps):
                 wp.launch(_load_targets, dim=self.data.ctrl.shape, inputs=[self._warp_targets, step, self.data.ctrl])
                 mjw.step(self.model, self.data)
@@ -112,7 +99,7 @@ class MjwarpEngine(StateTensors):
 
     def _record(self, instant: int) -> None:
         inputs = [self.data.qpos, self.data.qvel, instant, *self._warp_path]
-        wp.launch(_record_state, dim=self.num_worlds, inputs=inputs, device=self._warp_device)
+        wp.launch(_record_state, dim=self.num_worlds, inputs=inputs)
 
     def reset(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
         wide = mask.unsqueeze(-1)

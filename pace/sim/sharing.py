@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from functools import cache
 from typing import Any
 
 import torch
@@ -29,7 +31,20 @@ def torch_stream(device: torch.device) -> wp.Stream:
 
     Warp's default stream waits for torch's default one and the other way round, but for no other stream of torch.
     """
-    return wp.stream_from_torch(torch.cuda.current_stream(device))
+    return warp_stream(device, torch.cuda.current_stream(device).cuda_stream)
+
+
+@cache
+def warp_stream(device: torch.device, handle: int) -> wp.Stream:
+    """The stream of torch whose ``cuda_stream`` is the handle: one object each, by which Warp knows a capture."""
+    return wp.Stream(wp.device_from_torch(device), cuda_stream=handle)
+
+
+def warp_scope(device: torch.device) -> AbstractContextManager[Any]:
+    """Within it Warp works on ``device``, and on a GPU on torch's current stream."""
+    if device.type == "cuda":
+        return wp.ScopedStream(torch_stream(device), sync_enter=False)
+    return wp.ScopedDevice(wp.device_from_torch(device))
 
 
 def record(

@@ -1,14 +1,13 @@
 """The step and the reset never wait for the device: nothing in them reads a tensor's value on the host.
 
-Shown on the CPU device, where a wait costs nothing but takes the same calls. On a GPU the physics engine's part is one
-CUDA graph, within which nothing can wait.
+Shown on the CPU device, where a wait costs nothing but takes the same calls; ``test_graph.py`` shows that both can be
+replayed as CUDA graphs.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from types import SimpleNamespace
 from typing import Any, NoReturn
 
 import pytest
@@ -19,6 +18,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from pace.predictor.network import PredictorNetwork
 from pace.rl.env import TableTennisEnv
+from tests.rl.emulation import take_the_gpus_way
 from tests.rl.fakes import config
 
 N = 4
@@ -64,8 +64,9 @@ def _refuse(name: str) -> Any:
 
 @contextmanager
 def no_waiting() -> Iterator[None]:
-    """Within it, whatever would wait for the device raises :class:`Waits`."""
-    with pytest.MonkeyPatch.context() as patch, NoWaiting():
+    """Within it, whatever would wait for the device raises :class:`Waits`; a tensor made on no named device is on none,
+    as on a GPU it would have to be carried there."""
+    with pytest.MonkeyPatch.context() as patch, NoWaiting(), torch.device("meta"):
         for name in HANDING_OVER:
             patch.setattr(torch.Tensor, name, _refuse(name))
         for name in BRINGING:
@@ -91,35 +92,14 @@ def no_waiting() -> Iterator[None]:
         lambda t: t.cpu(),
         lambda t: t.tolist(),
         lambda t: t.copy_(torch.tensor([1.0, 2.0])),
+        lambda t: t + torch.ones(2),
         lambda t: wp.from_torch(t).numpy(),
         lambda t: wp.synchronize(),
     ],
 )
 def test_a_wait_is_found(call: Any) -> None:
-    with no_waiting(), pytest.raises(Waits):
+    with no_waiting(), pytest.raises((Waits, RuntimeError)):
         call(NUMBERS)
-
-
-class OnGpu(Tensor):
-    """A mask that says it lies on a GPU."""
-
-    @property
-    def device(self) -> Any:  # type: ignore[override]
-        return SimpleNamespace(type="cuda")
-
-
-def _take_the_gpus_way(env: TableTennisEnv) -> None:
-    """Where the masks lie on a CPU, three places look which worlds begin anew, to do less work; on a GPU none does."""
-
-    def on_gpu(function: Any, place: int) -> Any:
-        return lambda *args: function(*args[:place], args[place].as_subclass(OnGpu), *args[place + 1 :])
-
-    env.worlds.device = SimpleNamespace(type="cuda")  # type: ignore[assignment]
-    predict = env.actor._predict
-    of_some = on_gpu(predict, 1)
-    env.actor._predict = lambda *args: (predict if args[1] is None else of_some)(*args)  # type: ignore[method-assign]
-    for history in (env._policy_history, env._critic_history):
-        history.fill = on_gpu(history.fill, 0)  # type: ignore[method-assign]
 
 
 def test_neither_step_nor_reset_waits() -> None:
@@ -130,7 +110,7 @@ def test_neither_step_nor_reset_waits() -> None:
     masks = torch.rand(5, N, generator=generator) < 0.5
     env.advance(actions[0])  # kernels are compiled, and tensors bound, at the first step
     env.reset_worlds(masks[0])
-    _take_the_gpus_way(env)
+    take_the_gpus_way(env)
     with no_waiting():
         for action, mask in zip(actions[1:].unbind(), masks[1:].unbind(), strict=True):
             env.advance(action)
