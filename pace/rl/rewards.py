@@ -116,9 +116,9 @@ def predicted_net_height(state: TaskState, params: Params) -> Tensor:
     return torch.exp(error * (-1.0 / params["sigma"])) * paid
 
 
-@term("x", "y", "z", "time", "sigma")
+@term("x", "y", "z", "time", "reach")
 def return_velocity(state: TaskState, params: Params) -> Tensor:
-    """Once, at the hit: exp(-e / sigma), e how far the ball's velocity, m/s, is from a good return's.
+    """Once, at the hit: max(0, 1 - e / reach), e how far the ball's velocity, m/s, is from a good return's.
 
     That one would carry it from where it was hit to (x, y, z), m, in ``time`` s, without air. Between a ball that drops
     on the own half and one that clears the net lie those in the net, which have neither a landing nor a height there:
@@ -129,7 +129,7 @@ def return_velocity(state: TaskState, params: Params) -> Tensor:
     error = events.hit_velocity_out + events.hit_position / params["time"]
     for axis, aim in enumerate((params["x"], params["y"], lifted)):
         error[:, axis] -= aim / params["time"]
-    return torch.exp(_length(error) * (-1.0 / params["sigma"])) * state.game.referee.hit_now
+    return (1.0 - _length(error) / params["reach"]).clamp(min=0.0) * state.game.referee.hit_now
 
 
 @term("at_hit")

@@ -131,7 +131,9 @@ def test_return_velocity() -> None:
     events.hit_velocity_out[:] = good
     assert value("return_velocity", state, PACE) == pytest.approx(1.0, abs=1e-6)
     events.hit_velocity_out[:] = good + torch.tensor([-2.0, 1.0, -2.0])  # 3 m/s off
-    assert value("return_velocity", state, PACE) == pytest.approx(math.exp(-1.0), rel=1e-5)
+    assert value("return_velocity", state, PACE) == pytest.approx(1.0 - 3.0 / 8.0, rel=1e-5)
+    events.hit_velocity_out[:] = torch.tensor([-3.0, 0.0, -2.0])
+    assert value("return_velocity", state, PACE) == 0.0
     play(state, 0.5)
     assert value("return_velocity", state, PACE) == 0.0  # once
 
