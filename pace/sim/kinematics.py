@@ -167,14 +167,16 @@ def _paddle_jacobian_transpose(
 ):
     """Generalized force of a force on the paddle's link, at the end of the path."""
     world = wp.tid()
+    row = out[world]
+    for dof in range(row.shape[0]):
+        row[dof] = 0.0
+    push = wp.vec3(force[world, 0], force[world, 1], force[world, 2])
+    if push == wp.vec3():  # no ball on the blade: nearly always
+        return
     last = qpos_path.shape[1] - 1
     qpos = qpos_path[world, last]
     frame = _base(qpos, qvel_path[world, last])
-    push = wp.vec3(force[world, 0], force[world, 1], force[world, 2])
     at = wp.vec3(point[world, 0], point[world, 1], point[world, 2])
-    row = out[world]
-    for dof in range(6, row.shape[0]):
-        row[dof] = 0.0
     _store(row, 0, push)
     _store(row, 3, wp.quat_rotate_inv(frame.rotation, wp.cross(at - frame.position, push)))
     for link in range(chains.start[PADDLE], chains.start[PADDLE + 1]):

@@ -221,7 +221,7 @@ class Worlds:
         self.engine.apply_params(mask)
         self.engine.reset(mask, qpos, qvel)
         wide = mask.unsqueeze(-1)
-        self._previous_targets.copy_(torch.where(wide, qpos[:, 7:], self._previous_targets))
+        torch.where(wide, qpos[:, 7:], self._previous_targets, out=self._previous_targets)
         self.ball.events.paddle_impulse.masked_fill_(wide, 0.0)
         self._observe(mask)
 
@@ -230,7 +230,7 @@ class Worlds:
         wide = mask.unsqueeze(-1)
         states = (self.ball.position, self.ball.velocity, self.ball.spin)
         for target, value in zip(states, (position, velocity, spin), strict=True):
-            target.copy_(torch.where(wide, value, target))
+            torch.where(wide, value, target, out=target)
 
     def state_dict(self) -> dict[str, Tensor]:
         """All that the next control step depends on, besides the random generator."""

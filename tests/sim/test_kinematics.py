@@ -89,6 +89,7 @@ def test_paddle_pose_of_a_sensed_state(path, kinematics):
 def test_generalized_force_is_the_jacobian_transpose(model, path, kinematics):
     generator = torch.Generator().manual_seed(1)
     force = torch.randn(WORLDS, 3, generator=generator) * 20
+    force[0] = 0.0
     point = kinematics.paddle_path[:, -1, :3] + 0.05 * torch.randn(WORLDS, 3, generator=generator)
     out = torch.full((WORLDS, model.nv), torch.nan)
     kinematics.paddle_generalized_force(force, point, out)
