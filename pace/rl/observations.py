@@ -19,7 +19,7 @@ from torch import Tensor
 
 from pace.config import ConfigError, PredictorConfig
 from pace.predictor.network import OUTPUT_SIZES, predictor_slices
-from pace.rl.signal_kernels import PredictionLayout, append_frame, fill_frames, follow_ball, read_prediction
+from pace.rl.signal_kernels import PredictionLayout, fill_frames, follow_ball, read_prediction
 from pace.rl.state import TaskState
 from pace.rl.task_kernels import Rules
 from pace.sim.sensing import Sensing
@@ -269,14 +269,15 @@ class History:
         self.observation = torch.zeros(num_worlds, frames * size, device=device)
         self.frames = self.observation.view(num_worlds, frames, size)
         self._mask = torch.zeros(num_worlds, dtype=torch.bool, device=device)
-        arrays = [wp.from_torch(self.frame), wp.from_torch(self.observation)]
-        self._append = record(append_frame, num_worlds, arrays, device)
-        self._fill = record(fill_frames, num_worlds, [wp.from_torch(self._mask), *arrays], device)
+        arrays = [wp.from_torch(tensor) for tensor in (self._mask, self.frame, self.observation)]
+        self._fill = record(fill_frames, num_worlds, arrays, device)
 
     def push(self, signals: list[Tensor]) -> None:
         """Append a frame made of ``signals``, each (N, size)."""
         torch.cat(signals, dim=1, out=self.frame)
-        self._append()
+        for older in range(self.frames.shape[1] - 1):  # twice as fast as a kernel, which Warp does not vectorise
+            self.frames[:, older].copy_(self.frames[:, older + 1])
+        self.frames[:, -1].copy_(self.frame)
 
     def fill(self, mask: Tensor, signals: list[Tensor]) -> None:
         """Set all frames of the worlds of ``mask`` (N,) bool to the current one."""

@@ -91,19 +91,6 @@ def read_prediction(
 
 
 @wp.kernel
-def append_frame(frame: wp.array2d[wp.float32], observation: wp.array2d[wp.float32]):
-    """Drop the oldest frame of a world's row, and put the newest at its end."""
-    world = wp.tid()
-    row = observation[world]
-    size = frame.shape[1]
-    newest = row.shape[0] - size
-    for i in range(newest):
-        row[i] = row[i + size]
-    for i in range(size):
-        row[newest + i] = frame[world, i]
-
-
-@wp.kernel
 def fill_frames(mask: wp.array[wp.bool], frame: wp.array2d[wp.float32], observation: wp.array2d[wp.float32]):
     """Make all frames of the masked worlds the newest one."""
     world = wp.tid()
