@@ -82,7 +82,17 @@ def _double(values: Tensor) -> NDArray[np.float64]:
 
 
 def native_rates(config: BenchConfig) -> dict[str, float]:
-    """Raw MuJoCo and the native environment by turns, from the same states, with the same held joint targets."""
+    """Raw MuJoCo and the native environment by turns, with ``num_worlds`` worlds and with twice as many.
+
+    From the same states, with the same held joint targets.
+    """
+    twice = copy.deepcopy(config)
+    twice.num_worlds = 2 * config.num_worlds
+    doubled = {name.replace("_steps", "_2x_steps"): rate for name, rate in _native_rates(twice).items()}
+    return _native_rates(config) | doubled
+
+
+def _native_rates(config: BenchConfig) -> dict[str, float]:
     steps, cpu = config.bench.control_steps, torch.device("cpu")
     loop = EnvironmentLoop(config, "native", cpu, steps)
     worlds = loop.env.worlds
