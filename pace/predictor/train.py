@@ -47,7 +47,9 @@ class ServePractice:
     """Serves of N worlds, one after another, sensed as the robot's motion capture would: source of the regression.
 
     Attributes, overwritten by :meth:`advance`: ``predictor_input`` (N, 3 frames) m, ``predictor_target`` (N, out),
-    ``predictor_valid`` (N,) bool, ``predictor_time_to_apex`` (N,) s, as those of :class:`pace.rl.TableTennisEnv`.
+    ``predictor_valid`` (N,) bool, ``predictor_time_to_apex`` (N,) s, as those of :class:`pace.rl.TableTennisEnv`;
+    ``serve_over`` (N,) bool, the serve ended in this step and the next has begun. Besides: ``ball``
+    (:class:`pace.sim.ball.BallSim`) and ``sensing`` (:class:`pace.sim.sensing.Sensing`).
     """
 
     def __init__(self, config: TrainConfig, device: torch.device) -> None:
@@ -72,8 +74,9 @@ class ServePractice:
         still = {name: torch.zeros(count, size, device=device) for name, size in STILL_ROBOT.items()}
         self._robot: SimpleNamespace = SimpleNamespace(**still)
         joints = torch.zeros(0, device=device)
-        self._sensing = Sensing(config.sensing, count, device, config.robot.control_dt, joints, self.generator)
+        self.sensing = Sensing(config.sensing, count, device, config.robot.control_dt, joints, self.generator)
         self.predictor_input = self._track.positions
+        self.serve_over = self._game.ends.over
         self._serve(torch.ones(count, dtype=torch.bool, device=device))
         self._sense(torch.ones(count, dtype=torch.bool, device=device))
 
@@ -104,9 +107,9 @@ class ServePractice:
         self._game.start_serve(mask)
 
     def _sense(self, new_ball: Tensor) -> None:
-        self._sensing.update(self._robot, self.ball.position, new_ball)  # type: ignore[arg-type]
-        self._sensing.reset(new_ball, self._robot, self.ball.position)  # type: ignore[arg-type]
-        self._track.update(self._sensing.ball_position, new_ball)
+        self.sensing.update(self._robot, self.ball.position, new_ball)  # type: ignore[arg-type]
+        self.sensing.reset(new_ball, self._robot, self.ball.position)  # type: ignore[arg-type]
+        self._track.update(self.sensing.ball_position, new_ball)
         target, now = self._game.target, self._game.clock.time
         parts = {"apex": target.apex, "target": target.point, "target_time": (target.time - now).unsqueeze(-1)}
         self.predictor_target = torch.cat([parts[name] for name in self.config.predictor.outputs], dim=1)
