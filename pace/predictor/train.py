@@ -7,12 +7,14 @@ Examples::
 
     python -m pace.predictor.train                                  # the task of configs/train.yaml
     python -m pace.predictor.train predictor=paper sensing=clean samples=2e6
+    python -m pace.predictor.train predictor=filter                 # the whole flight for five positions
     python -m pace.rl.train init_from=runs/2026-01-01_predictor     # a policy that starts with this predictor
 """
 
 from __future__ import annotations
 
 import json
+import math
 import sys
 import time
 from pathlib import Path
@@ -31,6 +33,7 @@ from pace.rl.observations import BallTrack
 from pace.rl.progress import Progress
 from pace.rl.run_folder import METRICS, RunFolder, default_run_dir
 from pace.rl.task import Game, ServeSampler
+from pace.rl.trainer import StopRequest
 from pace.sim.ball import BallParams, BallSim
 from pace.sim.engine import EngineParams, resolve_device
 from pace.sim.randomization import Randomizer
@@ -146,21 +149,30 @@ class PredictorRun:
             self.practice.advance()
             self.trainer.record(t, self.practice)
 
+    def slow_down(self, done: float) -> None:
+        """Learning rate for the share ``done`` of the way: half a cosine, to a hundredth of ``learning_rate``."""
+        factor = 0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * done))
+        for group in self.trainer.optimiser.param_groups:
+            group["lr"] = factor * self.config.predictor.learning_rate
+
     def train(self, run: RunFolder) -> dict[str, float]:
-        """Fit rollout after rollout, each measured before it is fitted; returns updates, samples and seconds."""
+        """Fit rollout after rollout, each measured before it is fitted, to the end or to the first Ctrl-C or SIGTERM;
+        returns updates, samples and seconds."""
         config, per_update = self.config, self.config.num_worlds * self.config.algo.steps
         progress = Progress(config.progress, config.samples, 60.0 * config.minutes, shown=["predictor_rmse_cm"])
         started = last = time.monotonic()
-        update, limit = 0, 60.0 * config.minutes if config.minutes > 0 else float("inf")
-        while update * per_update < config.samples and last - started < limit:
-            self.play()
-            update += 1
-            now = time.monotonic()
-            row = {"update": update, "samples": update * per_update, "wall_s": now - started, **self.trainer.update()}
-            row["samples_per_s"] = per_update / (now - last)
-            last = now
-            run.log(row)
-            progress.show(row)
+        update, limit, stop = 0, 60.0 * config.minutes if config.minutes > 0 else math.inf, StopRequest()
+        with stop.listening():
+            while (done := max(update * per_update / config.samples, (last - started) / limit)) < 1 and not stop.name:
+                self.slow_down(done)
+                self.play()
+                update += 1
+                errors, now = self.trainer.update(), time.monotonic()
+                row = {"update": update, "samples": update * per_update, "wall_s": now - started, **errors}
+                row["samples_per_s"] = per_update / (now - last)
+                last = now
+                run.log(row)
+                progress.show(row)
         progress.close()
         return {"updates": update, "samples": update * per_update, "wall_s": last - started}
 
