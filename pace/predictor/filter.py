@@ -131,9 +131,11 @@ class FlightFilter(nn.Module):
         ages = self.ages.repeat(len(frames), 1)
         moved = (frames[..., 1:] != frames[..., :-1]).any(1).to(frames.dtype)
         age = FRAME * moved.sum(1, keepdim=True)
-        lowest, where = frames[:, 2].min(1, keepdim=True)
-        # up to its lowest place the ball has surely not bounced; below LOW that place may be behind the bounce already
-        falling = ages < torch.where(lowest < LOW, self.ages[where], FRAME) - 0.5 * FRAME
+        # before the first low place from which it rises the ball has surely not bounced; at that place it may have
+        low, rises = frames[:, 2] < LOW, frames[:, 2, 1:] > frames[:, 2, :-1]
+        turns = torch.cat([low[:, :-1] & rises, low[:, -1:]], dim=1).to(frames.dtype)
+        turned, where = turns.max(1, keepdim=True)
+        falling = ages < torch.where(turned > 0.0, self.ages[where], FRAME) - 0.5 * FRAME
         counts = (falling & (ages > -age - 0.5 * FRAME)).to(frames.dtype)
         velocity, fall, rise = (mean.expand_as(frames[..., 0]) for mean in self.means)
         before = self.fall(ages + age, counts, frames, Parabola(frames[..., 0], velocity, fall)).at(age)

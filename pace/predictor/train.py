@@ -42,6 +42,7 @@ from pace.sim.sensing import Sensing
 
 RESULT = "predictor.json"
 FINAL_ROLLOUTS = 20  # rollouts of the final measurement, which are never fitted
+SPREAD_STEPS = 50  # control steps, about as long as a serve
 STANDING = (-1.8, 0.0, 0.7)  # m, base of a robot that does not fall and plays no part
 FAR_AWAY = 100.0  # m, where the paddle is that nobody holds
 
@@ -90,13 +91,20 @@ class ServePractice:
         control_dt, ball = config.robot.control_dt, self.ball.params
         return Randomizer(config.randomization, config.ball, unused, ball, self.generator, model.nv, control_dt)
 
+    def spread(self) -> None:
+        """Begin serves at random times, so that every rollout holds all stretches of a flight; they began together."""
+        first = torch.randint(SPREAD_STEPS, (self.config.num_worlds,), generator=self.generator, device=self.device)
+        for step in range(SPREAD_STEPS):
+            self.advance(first == step)
+
     @torch.no_grad()
-    def advance(self) -> None:
-        """One control step; a serve that is over is followed by the next, with another ball and another delay."""
+    def advance(self, also: Tensor | None = None) -> None:
+        """One control step; a serve that is over is followed by the next, with another ball and another delay, as are
+        those of ``also`` (N,) bool."""
         self.ball.fly(self._path)
         self._game.judge()
         self._game.close()
-        over = self._game.ends.over
+        over = self._game.ends.over if also is None else self._game.ends.over | also
         self._serve(over)
         self._sense(over)
 
@@ -141,6 +149,7 @@ class PredictorRun:
         self.config = config
         self.network = PredictorNetwork(config.predictor).to(device)
         self.practice = ServePractice(config, device)
+        self.practice.spread()
         self.trainer = PredictorTrainer(self.network, config.predictor, config.algo.steps, config.num_worlds)
 
     def play(self) -> None:

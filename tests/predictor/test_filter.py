@@ -62,7 +62,7 @@ def test_it_finds_bounce_and_apex_of_the_tasks_flights() -> None:
     """Under the paper's noise and delay: the bounce within 3 ms, the apex within 4.5 cm before any learning."""
     serves = practice("randomization=none", "ball=paper")
     flight_filter, bounced_at = FlightFilter(WINDOW), torch.full((256,), torch.nan)
-    for step in range(1, 36):
+    for step in range(1, 35):
         serves.advance()
         bounce = serves.ball.events.own_bounce > 0
         within = serves.ball.events.own_bounce_time
