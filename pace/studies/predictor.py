@@ -21,6 +21,7 @@ from pace.studies.posterior import Question, answer
 
 FRAMES = 46  # control steps, 0.9 s: past the apex of every serve
 CHAINS, STEPS = 4, 900
+PREDICTED_SERVES = 1024
 SEED = 5
 #: What is known at a time: so many of the last sensed positions.
 WINDOWS = {"bound, five positions": 5, "bound, whole flight": FRAMES}
@@ -59,28 +60,34 @@ def case_config(case: str, serves: int) -> TrainConfig:
 
 
 def compare(case: str, serves: int, runs: Sequence[Path] = ()) -> Errors:
-    """Bounds and the predictors of ``runs`` at the same instants: one of each of ``serves`` serves in each bin."""
+    """Bounds, at one instant of each of ``serves`` serves in each bin, and the predictors of ``runs``, at every instant
+    of PREDICTED_SERVES."""
     config = case_config(case, serves)
     recording = record(config, FRAMES)
-    followed = {}
-    for run in runs:
-        predictor = load_predictor(run)
-        own = dataclasses.replace(config, predictor=predictor.config)
-        followed[run.name] = record(own, FRAMES, predictor.network).predicted
-    rmse: dict[str, list[float]] = {name: [] for name in (*WINDOWS, *followed)}
-    for instants in instants_of(recording):
-        chosen = instants >= 0
-        for name, frames in WINDOWS.items():
-            rmse[name].append(_bound(config, recording, instants, frames))
-        for name, predicted in followed.items():
-            rmse[name].append(_rmse(predicted[chosen, instants[chosen]] - recording.apex[chosen]))
-    return Errors(case, rmse)
+    instants = instants_of(recording)
+    rmse = {name: [_bound(config, recording, at, frames) for at in instants] for name, frames in WINDOWS.items()}
+    return Errors(case, rmse | {run.name: predicted_rmse(case, run) for run in runs})
+
+
+@torch.no_grad()
+def predicted_rmse(case: str, run: Path) -> list[float]:
+    """RMSE (cm) of a saved predictor by ``BEFORE_APEX``."""
+    predictor = load_predictor(run)
+    config = dataclasses.replace(case_config(case, PREDICTED_SERVES), predictor=predictor.config)
+    recording = record(config, FRAMES, predictor.network)
+    error = recording.predicted - recording.apex.unsqueeze(1)
+    bins = _bins(recording)
+    return [_rmse(error[recording.valid & (bins == number)]) for number in range(1, len(BIN_NAMES))]
+
+
+def _bins(recording: Recording) -> Tensor:
+    return torch.bucketize(recording.time_to_apex.contiguous(), torch.tensor(TIME_BINS), right=True)
 
 
 def instants_of(recording: Recording) -> list[Tensor]:
     """For each of ``BEFORE_APEX`` a random control step of every serve (N,) in that bin; -1 where it has none."""
     generator = torch.Generator().manual_seed(SEED)
-    bins = torch.bucketize(recording.time_to_apex.contiguous(), torch.tensor(TIME_BINS), right=True)
+    bins = _bins(recording)
     found = []
     for number in range(1, len(BIN_NAMES)):
         suits = recording.valid & (bins == number)
