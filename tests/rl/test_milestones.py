@@ -22,7 +22,7 @@ from pace.rl.milestones import (
 STEP = 10_000  # control steps of a row
 WINDOW = 50_000.0
 HITS_50 = Milestone("hits", 0.5)
-Rate = Callable[[float], float | str]
+Rate = Callable[[int], float | str]
 
 
 def write_run(
@@ -68,7 +68,7 @@ def test_shares_are_weighted_by_serves_and_empty_cells_left_out(tmp_path: Path) 
 
 
 def test_falls_count_from_the_worst_on(tmp_path: Path) -> None:
-    def falls(samples: float) -> float:
+    def falls(samples: int) -> float:
         return samples / 2e5 if samples <= 200_000 else max(0.0, 1.2 - samples / 1e6)
 
     curve = read_curve(write_run(tmp_path / "m.csv", falls=falls), WINDOW)
