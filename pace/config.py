@@ -339,6 +339,11 @@ class PredictorConfig:
     train_updates: int  # frozen afterwards; 0 trains it to the end
     outputs: list[str]  # of apex (3), target (3), target_time (1)
     enabled: bool  # off: the actor sees zeros instead (ablation)
+    features: str = "steps"  # steps (positions alone), flight (a fit of the whole flight, which needs many frames)
+
+    def __post_init__(self) -> None:
+        known = ("steps", "flight")
+        _require(self.features in known, f"predictor.features must be steps or flight, not {self.features!r}")
 
 
 @dataclass

@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from pace.bench import report, training
+from pace.bench import physics, report, training
 from pace.bench.__main__ import measure
+from pace.bench.environment import EnvironmentCrew
 from pace.bench.physics import RawMujoco
 from pace.bench.timing import median_seconds
+from pace.bench.training import BenchError
 from pace.bench.update import matrix_products
 from pace.config import BenchConfig, compose, load_train_config, parse
 
@@ -58,6 +60,8 @@ def test_whole_quick_run_writes_every_key(tmp_path: Path, monkeypatch: pytest.Mo
     assert written["settings"] == {"num_worlds": 4, "physics_steps": 2, "repeats": 1}
     share = written["native_env_steps_per_s"] / written["raw_mujoco_steps_per_s"]
     assert written["ratios"]["native_env_steps_per_s/raw_mujoco_steps_per_s"] == pytest.approx(share)
+    share = written["native_env_2x_steps_per_s"] / written["raw_mujoco_2x_steps_per_s"]
+    assert written["ratios"]["native_env_2x_steps_per_s/raw_mujoco_2x_steps_per_s"] == pytest.approx(share)
     assert 100.0 < written["peak_memory_mib"] < 3 * 1024
 
 
@@ -68,7 +72,30 @@ def test_parts_that_were_not_asked_for_are_null(tmp_path: Path) -> None:
     assert {name for name in report.FIGURES if written[name] is not None} == {
         "raw_mujoco_steps_per_s",
         "native_env_steps_per_s",
+        "native_env_one_process_steps_per_s",
+        "raw_mujoco_2x_steps_per_s",
+        "native_env_2x_steps_per_s",
+        "native_env_one_process_2x_steps_per_s",
     }
+
+
+def test_native_rates_are_of_n_and_of_twice_as_many_worlds(monkeypatch: pytest.MonkeyPatch) -> None:
+    def rates(config: BenchConfig) -> dict[str, float]:
+        return {"raw_mujoco_steps_per_s": float(config.num_worlds)}
+
+    monkeypatch.setattr(physics, "_native_rates", rates)
+    assert physics.native_rates(bench_config()) == {"raw_mujoco_steps_per_s": 4.0, "raw_mujoco_2x_steps_per_s": 8.0}
+
+
+def test_a_crew_plays_its_share_in_each_process_and_tells_of_one_that_failed() -> None:
+    with EnvironmentCrew(bench_config(), "native", 2) as crew:
+        crew.run()
+        assert [process.is_alive() for process in crew._processes] == [True, True]
+        crew._processes[1].kill()
+        crew._processes[1].join()
+        with pytest.raises(BenchError, match="crew"):
+            crew.run()
+    assert not crew._processes[0].is_alive()
 
 
 def test_ratios_and_table_of_known_figures() -> None:

@@ -13,37 +13,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pace.bench.environment import EnvironmentCrew, EnvironmentLoop
 from pace.bench.timing import median_seconds
 from pace.config import BenchConfig
-from pace.predictor.network import PredictorNetwork
-from pace.rl.env import TableTennisEnv
-
-
-class EnvironmentLoop:
-    """The whole environment on one engine, under random actions that are held for ``control_steps``."""
-
-    def __init__(self, config: BenchConfig, engine: str, device: torch.device, control_steps: int) -> None:
-        config = copy.deepcopy(config)
-        config.engine.name = engine
-        self.control_steps, self.action_std = control_steps, config.bench.action_std
-        predictor = PredictorNetwork(config.predictor).to(device)
-        self.env = TableTennisEnv(config, config.num_worlds, device, config.seed, predictor)
-        self.action = torch.zeros(config.num_worlds, self.env.action_spec.shape[-1], device=device)
-        self.draw()
-
-    def draw(self) -> None:
-        """New actions for every world."""
-        self.action.normal_().mul_(self.action_std)
-
-    def play(self, steps: int) -> None:
-        """Advance all worlds and reset those that are done, ``steps`` times."""
-        for _ in range(steps):
-            self.env.advance(self.action)
-            self.env.reset_worlds(self.env.terminated | self.env.truncated)
-
-    def run(self) -> None:
-        """One measured repeat."""
-        self.play(self.control_steps)
+from pace.team import suitable_size
 
 
 class RawMujoco:
@@ -82,7 +55,18 @@ def _double(values: Tensor) -> NDArray[np.float64]:
 
 
 def native_rates(config: BenchConfig) -> dict[str, float]:
-    """Raw MuJoCo and the native environment by turns, from the same states, with the same held joint targets."""
+    """Raw MuJoCo and the native environment by turns, with ``num_worlds`` worlds and with twice as many.
+
+    The environment in as many processes as training has, and in one with a thread a core. That one and raw MuJoCo begin
+    with the same states and hold the same joint targets; the others with states and targets of the same kind.
+    """
+    twice = copy.deepcopy(config)
+    twice.num_worlds = 2 * config.num_worlds
+    doubled = {name.replace("_steps", "_2x_steps"): rate for name, rate in _native_rates(twice).items()}
+    return _native_rates(config) | doubled
+
+
+def _native_rates(config: BenchConfig) -> dict[str, float]:
     steps, cpu = config.bench.control_steps, torch.device("cpu")
     loop = EnvironmentLoop(config, "native", cpu, steps)
     worlds = loop.env.worlds
@@ -94,11 +78,14 @@ def native_rates(config: BenchConfig) -> dict[str, float]:
         qpos, qvel = worlds.engine.qpos_path[:, -1], worlds.engine.qvel_path[:, -1]
         raw.start_from(qpos, qvel, worlds.nominal + config.robot.action_scale * loop.action)
 
-    seconds = median_seconds({"raw": raw.run, "native": loop.run}, config.bench.repeats, cpu, same_start)
+    with EnvironmentCrew(config, "native", suitable_size(config.num_worlds, cpu)) as crew:
+        measured = {"raw": raw.run, "native": crew.run, "one_process": loop.run}
+        seconds = median_seconds(measured, config.bench.repeats, cpu, same_start)
     samples = config.num_worlds * steps
     return {
         "raw_mujoco_steps_per_s": samples / seconds["raw"],
         "native_env_steps_per_s": samples / seconds["native"],
+        "native_env_one_process_steps_per_s": samples / seconds["one_process"],
     }
 
 

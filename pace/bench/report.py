@@ -17,6 +17,10 @@ FILE = "bench.json"
 FIGURES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "raw_mujoco_steps_per_s": ("mj_step alone, all cores", "steps/s", ()),
     "native_env_steps_per_s": ("environment, native engine", "steps/s", ("raw_mujoco_steps_per_s",)),
+    "native_env_one_process_steps_per_s": ("the same in one process", "steps/s", ("raw_mujoco_steps_per_s",)),
+    "raw_mujoco_2x_steps_per_s": ("mj_step alone, twice the worlds", "steps/s", ()),
+    "native_env_2x_steps_per_s": ("environment, twice the worlds", "steps/s", ("raw_mujoco_2x_steps_per_s",)),
+    "native_env_one_process_2x_steps_per_s": ("the same in one process", "steps/s", ("raw_mujoco_2x_steps_per_s",)),
     "mjwarp_env_steps_per_s": ("environment, MuJoCo Warp", "steps/s", ("native_env_steps_per_s",)),
     "ppo_fp32_samples_per_s": ("PPO update, fp32", "samples/s a pass", ("rsl_rl_fp32_samples_per_s",)),
     "rsl_rl_fp32_samples_per_s": ("rsl_rl's update, fp32", "samples/s a pass", ()),

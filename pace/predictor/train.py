@@ -7,12 +7,14 @@ Examples::
 
     python -m pace.predictor.train                                  # the task of configs/train.yaml
     python -m pace.predictor.train predictor=paper sensing=clean samples=2e6
+    python -m pace.predictor.train predictor=filter                 # the whole flight for five positions
     python -m pace.rl.train init_from=runs/2026-01-01_predictor     # a policy that starts with this predictor
 """
 
 from __future__ import annotations
 
 import json
+import math
 import sys
 import time
 from pathlib import Path
@@ -31,6 +33,7 @@ from pace.rl.observations import BallTrack
 from pace.rl.progress import Progress
 from pace.rl.run_folder import METRICS, RunFolder, default_run_dir
 from pace.rl.task import Game, ServeSampler
+from pace.rl.trainer import StopRequest
 from pace.sim.ball import BallParams, BallSim
 from pace.sim.engine import EngineParams, resolve_device
 from pace.sim.randomization import Randomizer
@@ -39,6 +42,7 @@ from pace.sim.sensing import Sensing
 
 RESULT = "predictor.json"
 FINAL_ROLLOUTS = 20  # rollouts of the final measurement, which are never fitted
+SPREAD_STEPS = 50  # control steps, about as long as a serve
 STANDING = (-1.8, 0.0, 0.7)  # m, base of a robot that does not fall and plays no part
 FAR_AWAY = 100.0  # m, where the paddle is that nobody holds
 
@@ -47,7 +51,9 @@ class ServePractice:
     """Serves of N worlds, one after another, sensed as the robot's motion capture would: source of the regression.
 
     Attributes, overwritten by :meth:`advance`: ``predictor_input`` (N, 3 frames) m, ``predictor_target`` (N, out),
-    ``predictor_valid`` (N,) bool, ``predictor_time_to_apex`` (N,) s, as those of :class:`pace.rl.TableTennisEnv`.
+    ``predictor_valid`` (N,) bool, ``predictor_time_to_apex`` (N,) s, as those of :class:`pace.rl.TableTennisEnv`;
+    ``serve_over`` (N,) bool, the serve ended in this step and the next has begun. Besides: ``ball``
+    (:class:`pace.sim.ball.BallSim`) and ``sensing`` (:class:`pace.sim.sensing.Sensing`).
     """
 
     def __init__(self, config: TrainConfig, device: torch.device) -> None:
@@ -72,8 +78,9 @@ class ServePractice:
         still = {name: torch.zeros(count, size, device=device) for name, size in STILL_ROBOT.items()}
         self._robot: SimpleNamespace = SimpleNamespace(**still)
         joints = torch.zeros(0, device=device)
-        self._sensing = Sensing(config.sensing, count, device, config.robot.control_dt, joints, self.generator)
+        self.sensing = Sensing(config.sensing, count, device, config.robot.control_dt, joints, self.generator)
         self.predictor_input = self._track.positions
+        self.serve_over = self._game.ends.over
         self._serve(torch.ones(count, dtype=torch.bool, device=device))
         self._sense(torch.ones(count, dtype=torch.bool, device=device))
 
@@ -84,13 +91,20 @@ class ServePractice:
         control_dt, ball = config.robot.control_dt, self.ball.params
         return Randomizer(config.randomization, config.ball, unused, ball, self.generator, model.nv, control_dt)
 
+    def spread(self) -> None:
+        """Begin serves at random times, so that every rollout holds all stretches of a flight; they began together."""
+        first = torch.randint(SPREAD_STEPS, (self.config.num_worlds,), generator=self.generator, device=self.device)
+        for step in range(SPREAD_STEPS):
+            self.advance(first == step)
+
     @torch.no_grad()
-    def advance(self) -> None:
-        """One control step; a serve that is over is followed by the next, with another ball and another delay."""
+    def advance(self, also: Tensor | None = None) -> None:
+        """One control step; a serve that is over is followed by the next, with another ball and another delay, as are
+        those of ``also`` (N,) bool."""
         self.ball.fly(self._path)
         self._game.judge()
         self._game.close()
-        over = self._game.ends.over
+        over = self._game.ends.over if also is None else self._game.ends.over | also
         self._serve(over)
         self._sense(over)
 
@@ -104,9 +118,9 @@ class ServePractice:
         self._game.start_serve(mask)
 
     def _sense(self, new_ball: Tensor) -> None:
-        self._sensing.update(self._robot, self.ball.position, new_ball)  # type: ignore[arg-type]
-        self._sensing.reset(new_ball, self._robot, self.ball.position)  # type: ignore[arg-type]
-        self._track.update(self._sensing.ball_position, new_ball)
+        self.sensing.update(self._robot, self.ball.position, new_ball)  # type: ignore[arg-type]
+        self.sensing.reset(new_ball, self._robot, self.ball.position)  # type: ignore[arg-type]
+        self._track.update(self.sensing.ball_position, new_ball)
         target, now = self._game.target, self._game.clock.time
         parts = {"apex": target.apex, "target": target.point, "target_time": (target.time - now).unsqueeze(-1)}
         self.predictor_target = torch.cat([parts[name] for name in self.config.predictor.outputs], dim=1)
@@ -135,6 +149,7 @@ class PredictorRun:
         self.config = config
         self.network = PredictorNetwork(config.predictor).to(device)
         self.practice = ServePractice(config, device)
+        self.practice.spread()
         self.trainer = PredictorTrainer(self.network, config.predictor, config.algo.steps, config.num_worlds)
 
     def play(self) -> None:
@@ -143,21 +158,30 @@ class PredictorRun:
             self.practice.advance()
             self.trainer.record(t, self.practice)
 
+    def slow_down(self, done: float) -> None:
+        """Learning rate for the share ``done`` of the way: half a cosine, to a hundredth of ``learning_rate``."""
+        factor = 0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * done))
+        for group in self.trainer.optimiser.param_groups:
+            group["lr"] = factor * self.config.predictor.learning_rate
+
     def train(self, run: RunFolder) -> dict[str, float]:
-        """Fit rollout after rollout, each measured before it is fitted; returns updates, samples and seconds."""
+        """Fit rollout after rollout, each measured before it is fitted, to the end or to the first Ctrl-C or SIGTERM;
+        returns updates, samples and seconds."""
         config, per_update = self.config, self.config.num_worlds * self.config.algo.steps
         progress = Progress(config.progress, config.samples, 60.0 * config.minutes, shown=["predictor_rmse_cm"])
         started = last = time.monotonic()
-        update, limit = 0, 60.0 * config.minutes if config.minutes > 0 else float("inf")
-        while update * per_update < config.samples and last - started < limit:
-            self.play()
-            update += 1
-            now = time.monotonic()
-            row = {"update": update, "samples": update * per_update, "wall_s": now - started, **self.trainer.update()}
-            row["samples_per_s"] = per_update / (now - last)
-            last = now
-            run.log(row)
-            progress.show(row)
+        update, limit, stop = 0, 60.0 * config.minutes if config.minutes > 0 else math.inf, StopRequest()
+        with stop.listening():
+            while (done := max(update * per_update / config.samples, (last - started) / limit)) < 1 and not stop.name:
+                self.slow_down(done)
+                self.play()
+                update += 1
+                errors, now = self.trainer.update(), time.monotonic()
+                row = {"update": update, "samples": update * per_update, "wall_s": now - started, **errors}
+                row["samples_per_s"] = per_update / (now - last)
+                last = now
+                run.log(row)
+                progress.show(row)
         progress.close()
         return {"updates": update, "samples": update * per_update, "wall_s": last - started}
 

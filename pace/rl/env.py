@@ -243,6 +243,10 @@ class TableTennisEnv(EnvBase):
         total = self.reward + self._policy_history.frame.sum(1) + self._critic_history.frame.sum(1)
         self._bad.logical_or_(total.isfinite().logical_not_())
 
+    def warn_of_overflow(self) -> None:
+        """See :meth:`pace.sim.worlds.Worlds.warn_of_overflow`."""
+        self.worlds.warn_of_overflow()
+
     def first_bad(self) -> str | None:
         """World and term of a value that was not finite, or None. Waits for the device: ask once an update."""
         worlds = self._bad.nonzero()

@@ -197,7 +197,7 @@ def play(env: TableTennisEnv, policy: TaskPolicy, recorder: ServeRecorder, on_co
     bad = env.first_bad()
     if bad is not None:
         raise EvaluationError(bad)
-    env.worlds.warn_of_overflow()
+    env.warn_of_overflow()
 
 
 def evaluate_row(

@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from torch import Tensor
 
-from pace.config import ConfigError, TrainConfig, compose, config_dir, parse, to_dict
+from pace.config import ConfigError, PredictorConfig, TrainConfig, compose, config_dir, parse, to_dict
 from pace.predictor.network import PredictorNetwork
 from pace.rl.checkpoint import META, TRAINING, WEIGHTS, Checkpoint, CheckpointError, load_checkpoint, load_weights
 from pace.rl.observations import JOINTS, POLICY
@@ -74,6 +74,14 @@ class TaskPolicy:
         return TableTennisEnv(config, num_worlds, where, seed, self.predictor)
 
 
+@dataclass(frozen=True)
+class TrainedPredictor:
+    """A saved predictor and how it was configured."""
+
+    config: PredictorConfig
+    network: PredictorNetwork
+
+
 def load_policy(path: str | Path, device: str | torch.device = "cpu") -> TaskPolicy:
     """The policy of a run folder (its newest checkpoint), a checkpoint, a file in one, or ``pretrained/<name>``.
 
@@ -96,6 +104,15 @@ def load_policy(path: str | Path, device: str | torch.device = "cpu") -> TaskPol
         load_weights(module, weights, f"{checkpoint.path} ({name})")
         module.requires_grad_(False).eval()
     return TaskPolicy(config, network, predictor, str(checkpoint.path), checkpoint.counters).to(device)
+
+
+def load_predictor(path: str | Path) -> TrainedPredictor:
+    """The predictor of a run, of a policy or trained alone; ``path`` and errors as those of :func:`load_policy`."""
+    checkpoint = load_checkpoint(locate(path), weights_only=True)
+    config = saved_config(checkpoint).predictor
+    network = PredictorNetwork(config)
+    load_weights(network, _part(checkpoint, "predictor"), f"{checkpoint.path} (predictor)")
+    return TrainedPredictor(config, network.requires_grad_(False).eval())
 
 
 def locate(path: str | Path) -> Path:

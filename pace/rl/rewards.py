@@ -103,8 +103,8 @@ def predicted_landing(state: TaskState, params: Params) -> Tensor:
     """Once, at the hit: offset minus the distance of the forecast landing to (x, y), m; 0 without a landing."""
     landing = state.game.returns.landing
     paid = state.game.referee.hit_now & landing[:, 0].isfinite()
-    x, y = torch.where(paid, landing[:, 0], 0.0), torch.where(paid, landing[:, 1], 0.0)
-    return (params["offset"] - torch.hypot(x - params["x"], y - params["y"])) * paid
+    distance = torch.hypot(landing[:, 0] - params["x"], landing[:, 1] - params["y"])
+    return torch.where(paid, params["offset"] - distance, 0.0)
 
 
 @term("z", "sigma")
@@ -112,13 +112,13 @@ def predicted_net_height(state: TaskState, params: Params) -> Tensor:
     """Once, at the hit: how near to z the ball will cross the net's plane towards the opponent, m."""
     height = state.game.returns.net_height
     paid = state.game.referee.hit_now & height.isfinite()
-    error = (torch.where(paid, height, 0.0) - params["z"]).abs()
-    return torch.exp(error * (-1.0 / params["sigma"])) * paid
+    error = (height - params["z"]).abs_()
+    return torch.where(paid, error.mul_(-1.0 / params["sigma"]).exp_(), 0.0)
 
 
-@term("x", "y", "z", "time", "sigma")
+@term("x", "y", "z", "time", "reach")
 def return_velocity(state: TaskState, params: Params) -> Tensor:
-    """Once, at the hit: exp(-e / sigma), e how far the ball's velocity, m/s, is from a good return's.
+    """Once, at the hit: max(0, 1 - e / reach), e how far the ball's velocity, m/s, is from a good return's.
 
     That one would carry it from where it was hit to (x, y, z), m, in ``time`` s, without air. Between a ball that drops
     on the own half and one that clears the net lie those in the net, which have neither a landing nor a height there:
@@ -129,7 +129,7 @@ def return_velocity(state: TaskState, params: Params) -> Tensor:
     error = events.hit_velocity_out + events.hit_position / params["time"]
     for axis, aim in enumerate((params["x"], params["y"], lifted)):
         error[:, axis] -= aim / params["time"]
-    return torch.exp(_length(error) * (-1.0 / params["sigma"])) * state.game.referee.hit_now
+    return (1.0 - _length(error) / params["reach"]).clamp(min=0.0) * state.game.referee.hit_now
 
 
 @term("at_hit")
@@ -195,7 +195,7 @@ def undesired_contact(state: TaskState, params: Params) -> Tensor:
 @term("distance")
 def paddle_near_head(state: TaskState, params: Params) -> Tensor:
     """How much nearer than ``distance`` the paddle is to the head, m."""
-    return (params["distance"] - _length(state.robot.paddle_position - state.robot.head_position)).clamp(min=0.0)
+    return (params["distance"] - state.measures["paddle_to_head"]).clamp(min=0.0)
 
 
 # --- joints -----------------------------------------------------------------------------------------------------------
@@ -204,25 +204,25 @@ def paddle_near_head(state: TaskState, params: Params) -> Tensor:
 @term()
 def joint_power(state: TaskState, params: Params) -> Tensor:
     """Norm over the joints of torque times velocity, W."""
-    return state.joint_power.square().sum(1).sqrt()
+    return state.measures["joint_power"]
 
 
 @term()
 def ankle_power(state: TaskState, params: Params) -> Tensor:
     """The same over the ankles."""
-    return (state.joint_power.square() @ state.groups["ankles"]).sqrt()
+    return state.measures["ankle_power"]
 
 
 @term()
 def joint_acceleration(state: TaskState, params: Params) -> Tensor:
     """Squared, summed over the joints, (rad/s^2)^2."""
-    return state.robot.joint_acceleration.square().sum(1)
+    return state.measures["joint_acceleration"]
 
 
 @term()
 def action_rate(state: TaskState, params: Params) -> Tensor:
     """Squared change of the action, summed over the joints."""
-    return (state.action - state.previous_action).square().sum(1)
+    return state.measures["action_change"]
 
 
 @term("fraction")
@@ -236,19 +236,19 @@ def joint_limits(state: TaskState, params: Params) -> Tensor:
 @term()
 def deviation_hip_waist_left_arm(state: TaskState, params: Params) -> Tensor:
     """Sum of |joint - nominal| over hip yaw and roll, waist and left arm without its shoulder roll, rad."""
-    return state.joint_deviation @ state.groups["hip_waist_left_arm"]
+    return state.measures["hip_waist_left_arm"]
 
 
 @term()
 def deviation_left_shoulder_roll(state: TaskState, params: Params) -> Tensor:
     """|joint - nominal|, rad."""
-    return state.joint_deviation @ state.groups["left_shoulder_roll"]
+    return state.measures["left_shoulder_roll"]
 
 
 @term()
 def deviation_right_arm(state: TaskState, params: Params) -> Tensor:
     """Sum of |joint - nominal|, rad."""
-    return state.joint_deviation @ state.groups["right_arm"]
+    return state.measures["right_arm"]
 
 
 # --- feet -------------------------------------------------------------------------------------------------------------
@@ -263,13 +263,13 @@ def both_feet_air(state: TaskState, params: Params) -> Tensor:
 @term()
 def foot_tilt(state: TaskState, params: Params) -> Tensor:
     """Squared horizontal part of the soles' normals, summed over the feet."""
-    return state.robot.foot_up[:, :, :2].square().sum((1, 2))
+    return state.measures["foot_tilt"]
 
 
 @term()
 def foot_slide(state: TaskState, params: Params) -> Tensor:
     """Horizontal speed of the feet in contact, summed, m/s."""
-    return (_length(state.robot.foot_velocity[:, :, :2]) * state.foot_contact).sum(1)
+    return state.measures["foot_slide"]
 
 
 @term("threshold", "limit")
@@ -281,9 +281,7 @@ def foot_force(state: TaskState, params: Params) -> Tensor:
 @term("ratio")
 def foot_stumble(state: TaskState, params: Params) -> Tensor:
     """A foot meets something upright: horizontal force above ``ratio`` times the vertical one."""
-    force = state.robot.foot_force
-    stumbles = _length(force[:, :, :2]) > params["ratio"] * force[:, :, 2].abs()
-    return (stumbles & state.foot_contact).any(1).float()
+    return (state.measures["foot_steepness"] > params["ratio"]).float()
 
 
 @term("distance")

@@ -1,4 +1,7 @@
-"""What the robot computes from its sensors, as Warp kernels, one thread a world. See :mod:`pace.rl.observations`."""
+"""What the robot computes from its sensors, and the histories of both networks' inputs, as Warp kernels.
+
+One thread a world. See :mod:`pace.rl.observations`.
+"""
 
 import warp as wp
 
@@ -85,3 +88,15 @@ def read_prediction(
     time[world] = left
     base = base_position[world]
     shift[world] = stand - wp.vec2(base[0], base[1]) + shift_noise[world]
+
+
+@wp.kernel
+def fill_frames(mask: wp.array[wp.bool], frame: wp.array2d[wp.float32], observation: wp.array2d[wp.float32]):
+    """Make all frames of the masked worlds the newest one."""
+    world = wp.tid()
+    if not mask[world]:
+        return
+    row = observation[world]
+    size = frame.shape[1]
+    for i in range(row.shape[0]):
+        row[i] = frame[world, i % size]

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from pace.rl.reward_kernels import JointArrays, Measures, RobotArrays, measure
 from pace.rl.task import Game
 from pace.rl.task_kernels import DerivedArrays, derive
 from pace.sim.sharing import record, share, share_all
@@ -38,8 +39,13 @@ class TaskState:
     """True state of the task after a control step. Privileged: the actor never reads it.
 
     Attributes: ``robot``, ``ball`` (simulation), ``game`` (rules and forecast), ``action`` and ``previous_action``
-    (N, J); ``nominal``, ``joint_lower``, ``joint_upper`` (J,) rad; ``groups`` name -> (J,) of 0 and 1.
-    After :meth:`refresh`: ``joint_power`` (N, J) W, ``joint_deviation`` (N, J) rad, and what :meth:`derive` computes:
+    (N, J); ``nominal``, ``joint_lower``, ``joint_upper`` (J,) rad.
+    After :meth:`refresh`: ``measures`` name -> (N,) as its kernel computes them: ``joint_power`` and ``ankle_power`` W,
+    norms over the joints of torque times velocity; ``joint_acceleration`` (rad/s^2)^2 and ``action_change``, sums of
+    squares; the sum of |joint - nominal| over each other group of :data:`JOINT_GROUPS`, rad; ``foot_tilt``, squared
+    horizontal part of the soles' normals, ``foot_slide`` m/s, horizontal speed of the feet in contact, both summed;
+    ``foot_steepness``, the largest horizontal over vertical force of a foot in contact; ``paddle_to_head`` m.
+    Also what :meth:`derive` computes:
     ``something_to_hit`` (N,) bool; ``apex``, ``target`` (N, 3) m, the point to stand by where there is nothing to hit;
     ``arrival`` (N,) s until the ball is at the target, 0 where there is nothing to hit; ``base_error``, ``shift``
     (N, 2) m from the base to where it should stand, for the rewards and as the networks see it; ``foot_load``
@@ -54,13 +60,8 @@ class TaskState:
         count, joints, device = worlds.num_worlds, worlds.nominal.shape[0], worlds.device
         self.action = torch.zeros(count, joints, device=device)
         self.previous_action = torch.zeros(count, joints, device=device)
-        self.groups = {
-            group: torch.tensor([float(belongs(name)) for name in worlds.joint_names], device=device)
-            for group, belongs in JOINT_GROUPS.items()
-        }
         self.lost, self.something_to_hit = game.ends.lost, game.target.something_to_hit
-        self.joint_power = torch.zeros(count, joints, device=device)
-        self.joint_deviation = torch.zeros(count, joints, device=device)
+        self.measures = {name: torch.zeros(count, device=device) for name in Measures.vars}  # type: ignore[attr-defined]
         self._allocate(count, device)
         self._record(worlds)
 
@@ -78,12 +79,19 @@ class TaskState:
         derived = share_all(DerivedArrays, vars(self))
         inputs = [self.game.arrays(), derived, *(share(tensor) for tensor in seen), self.game.rules]
         self._derive = record(derive, worlds.num_worlds, inputs, worlds.device)
+        self._joints = {"nominal": self.nominal} | {
+            group: torch.tensor([float(belongs(name)) for name in worlds.joint_names], device=worlds.device)
+            for group, belongs in JOINT_GROUPS.items()
+        }
+        actions = {"action": self.action, "previous_action": self.previous_action}
+        measured = share_all(RobotArrays, vars(robot) | actions)
+        arrays = [share_all(JointArrays, self._joints), share(self.foot_contact), share_all(Measures, self.measures)]
+        self._measure = record(measure, worlds.num_worlds, [measured, *arrays], worlds.device)
 
     def refresh(self) -> None:
         """Compute all shared quantities from the robot's and the ball's new state."""
-        torch.mul(self.robot.joint_torque, self.robot.joint_velocity, out=self.joint_power)
-        torch.sub(self.robot.joint_position, self.nominal, out=self.joint_deviation).abs_()
         self._derive()
+        self._measure()
 
     def derive(self) -> None:
         """Compute those again that change with a new serve."""

@@ -16,6 +16,7 @@ from pace.rl import task_kernels
 from pace.rl.outcome import Outcome
 from pace.rl.task_kernels import GameArrays, Rules
 from pace.sim.ball_kernels import EventArrays, ForecastArrays
+from pace.sim.randomization import bounds, uniform
 from pace.sim.sharing import record, share, share_all
 from pace.sim.snapshot import restore, snapshot, under_prefix, with_prefix
 
@@ -23,18 +24,6 @@ if TYPE_CHECKING:
     from pace.sim.ball import BallSim
 
 __all__ = ["Game", "Outcome", "PoseSampler", "ServeSampler"]
-
-
-def uniform(generator: torch.Generator, low: Tensor, high: Tensor, num_worlds: int) -> Tensor:
-    """Samples (N, C) between rows ``low`` and ``high`` (C,)."""
-    sample = torch.rand(num_worlds, low.shape[0], device=low.device, generator=generator)
-    return sample.mul_(high - low).add_(low)
-
-
-def bounds(ranges: list[list[float]], device: torch.device) -> tuple[Tensor, Tensor]:
-    """Lower and upper row (C,) of C ranges."""
-    table = torch.tensor(ranges, dtype=torch.float32, device=device)
-    return table[:, 0].contiguous(), table[:, 1].contiguous()
 
 
 class ServeSampler:
@@ -63,30 +52,30 @@ class PoseSampler:
         joint_names: tuple[str, ...],
         generator: torch.Generator,
     ) -> None:
-        self._generator = generator
-        self._nominal = nominal
-        self._limits = limits
+        self._generator, self._limits = generator, limits
         self._height = robot.base_height
         ranges = [config.base_x, config.base_y, config.yaw, *[config.linear_velocity] * 3]
         ranges += [config.roll_pitch_rate, config.roll_pitch_rate, config.yaw_rate]
-        right_arm = [name.startswith("Right") and ("Shoulder" in name or "Elbow" in name) for name in joint_names]
-        ranges += [config.right_arm_offset if right else config.joint_scale for right in right_arm]
+        for name, angle in zip(joint_names, nominal.tolist(), strict=True):
+            right_arm = name.startswith("Right") and ("Shoulder" in name or "Elbow" in name)
+            if right_arm:
+                ranges.append([angle + end for end in config.right_arm_offset])
+            else:
+                ranges.append([angle * end for end in config.joint_scale])
         self._low, self._high = bounds(ranges, nominal.device)
-        self._right_arm = torch.tensor(right_arm, device=nominal.device)
 
     def sample(self, num_worlds: int) -> tuple[Tensor, Tensor]:
         """qpos (N, 7 + J) and qvel (N, 6 + J) of MuJoCo; joints within their limits and at rest."""
         sample = uniform(self._generator, self._low, self._high, num_worlds)
-        joints = self._nominal.shape[0]
+        joints = sample.shape[1] - 9
         qpos, qvel = sample.new_zeros(num_worlds, 7 + joints), sample.new_zeros(num_worlds, 6 + joints)
         qpos[:, :2] = sample[:, :2]
         qpos[:, 2] = self._height
         half_yaw = 0.5 * sample[:, 2]
-        qpos[:, 3], qpos[:, 6] = torch.cos(half_yaw), torch.sin(half_yaw)
+        torch.cos(half_yaw, out=qpos[:, 3])
+        torch.sin(half_yaw, out=qpos[:, 6])
+        torch.clamp(sample[:, 9:], *self._limits, out=qpos[:, 7:])
         qvel[:, :6] = sample[:, 3:9]
-        drawn = sample[:, 9:]
-        pose = torch.where(self._right_arm, self._nominal + drawn, self._nominal * drawn)
-        qpos[:, 7:] = pose.clamp(*self._limits)
         return qpos, qvel
 
 

@@ -48,6 +48,10 @@ class TrainableTask(VectorTask, PredictorSource, Protocol):
         """Sums since the last call, 0-d tensors: serves, hits, successes, falls, episodes, steps, rewards, ..."""
         ...
 
+    def warn_of_overflow(self) -> None:
+        """Warn, once, of worlds that the engine had no room for. May wait for the device."""
+        ...
+
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next control step depends on."""
         ...
@@ -229,6 +233,7 @@ class Trainer:
 
     def save(self) -> None:
         """Write a checkpoint of this moment and drop old ones."""
+        self.env.warn_of_overflow()
         checkpoint = self.checkpoint()
         if self.run is not None:
             save_checkpoint(self.run.path / FOLDER / f"update_{self.updates:08d}", checkpoint)

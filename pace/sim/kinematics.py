@@ -96,6 +96,8 @@ def _store(row: wp.array[float], start: int, value: wp.vec3):
 
 @wp.kernel
 def _update(
+    mask: wp.array[wp.bool],
+    masked: int,
     chains: Chains,
     qpos_path: wp.array3d[float],
     qvel_path: wp.array3d[float],
@@ -105,8 +107,13 @@ def _update(
     foot_up: wp.array3d[float],
     head_position: wp.array2d[float],
 ):
-    """One item of one world: the paddle at each instant of the path, then both feet and the head at its end."""
+    """One item of one world: the paddle at each instant of the path, then both feet and the head at its end.
+
+    With ``masked`` of the masked worlds only.
+    """
     world, item = wp.tid()
+    if masked == 1 and not mask[world]:
+        return
     instants = qpos_path.shape[1]
     instant = wp.min(item, instants - 1)
     chain = wp.max(item - instants + 1, PADDLE)
@@ -160,14 +167,16 @@ def _paddle_jacobian_transpose(
 ):
     """Generalized force of a force on the paddle's link, at the end of the path."""
     world = wp.tid()
+    row = out[world]
+    for dof in range(row.shape[0]):
+        row[dof] = 0.0
+    push = wp.vec3(force[world, 0], force[world, 1], force[world, 2])
+    if push == wp.vec3():  # no ball on the blade: nearly always
+        return
     last = qpos_path.shape[1] - 1
     qpos = qpos_path[world, last]
     frame = _base(qpos, qvel_path[world, last])
-    push = wp.vec3(force[world, 0], force[world, 1], force[world, 2])
     at = wp.vec3(point[world, 0], point[world, 1], point[world, 2])
-    row = out[world]
-    for dof in range(6, row.shape[0]):
-        row[dof] = 0.0
     _store(row, 0, push)
     _store(row, 3, wp.quat_rotate_inv(frame.rotation, wp.cross(at - frame.position, push)))
     for link in range(chains.start[PADDLE], chains.start[PADDLE + 1]):
@@ -235,20 +244,26 @@ class Kinematics:
         self.head_position = torch.zeros(num_worlds, 3, device=device)
         outputs = (self.paddle_path, self.foot_position, self.foot_velocity, self.foot_up, self.head_position)
         self._outputs = [wp.from_torch(t) for t in outputs]
+        self._mask = torch.zeros(num_worlds, dtype=torch.bool, device=device)
         self._path: tuple[Tensor, Tensor] | None = None
         self._sensed_centre = torch.zeros(num_worlds, 3, device=device)
         self._sensed_normal = torch.zeros(num_worlds, 3, device=device)
         self._sensed_pose: tuple[Tensor | None, ...] = (None, None, None)
         self._push: tuple[Tensor | None, ...] = (None, None, None)
 
-    def update(self, qpos_path: Tensor, qvel_path: Tensor) -> None:
+    def update(self, qpos_path: Tensor, qvel_path: Tensor, mask: Tensor | None = None) -> None:
         """Fill the attributes from qpos (N, S + 1, 28) and qvel (N, S + 1, 27).
 
-        The path is remembered: :meth:`paddle_generalized_force` uses its end.
+        ``mask`` (N,) bool: the worlds in which they are new; ``None``: all. The path is remembered:
+        :meth:`paddle_generalized_force` uses its end.
         """
         if self._path is None or self._path[0] is not qpos_path or self._path[1] is not qvel_path:
             self._bind(qpos_path, qvel_path)
-        self._update()
+        if mask is None:
+            self._update()
+        else:
+            self._mask.copy_(mask)
+            self._update_masked()
 
     def _bind(self, qpos_path: Tensor, qvel_path: Tensor) -> None:
         worlds, instants, _ = self.paddle_path.shape
@@ -259,7 +274,9 @@ class Kinematics:
         self._warp_path = [wp.from_torch(qpos_path), wp.from_torch(qvel_path)]
         self._push = (None, None, None)  # its launch holds the old path
         inputs = [self._chains, *self._warp_path, *self._outputs]
-        self._update = record(_update, (worlds, instants + len(TIPS) - 1), inputs, self._device)
+        mask, items = wp.from_torch(self._mask), (worlds, instants + len(TIPS) - 1)
+        self._update = record(_update, items, [mask, 0, *inputs], self._device)
+        self._update_masked = record(_update, items, [mask, 1, *inputs], self._device)
 
     def paddle_pose(self, base_position: Tensor, base_quat: Tensor, joint_position: Tensor) -> tuple[Tensor, Tensor]:
         """Paddle centre (N, 3) m and unit normal (N, 3), world frame, of any pose, for instance a sensed one.

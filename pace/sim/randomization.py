@@ -28,6 +28,18 @@ BALL_DRAWS = {
 BALL_LIMITS = {"table_restitution": (0.0, 1.0), "paddle_restitution": (0.0, 1.0)}
 
 
+def uniform(generator: torch.Generator, low: Tensor, high: Tensor, num_worlds: int) -> Tensor:
+    """Samples (N, C) between rows ``low`` and ``high`` (C,)."""
+    sample = torch.rand(num_worlds, low.shape[0], device=low.device, generator=generator)
+    return sample.mul_(high - low).add_(low)
+
+
+def bounds(ranges: list[list[float]], device: torch.device) -> tuple[Tensor, Tensor]:
+    """Lower and upper row (C,) of C ranges."""
+    table = torch.tensor(ranges, dtype=torch.float32, device=device)
+    return table[:, 0].contiguous(), table[:, 1].contiguous()
+
+
 class Randomizer:
     """Draws the parameters of N worlds at reset, and the pushes in between.
 
@@ -58,36 +70,44 @@ class Randomizer:
         self.push = torch.zeros(num_worlds, num_velocities, device=device)
         self.pushes_enabled = config.push_interval[1] > 0.0
         self._until_push = torch.zeros(num_worlds, device=device)
+        self._drawn = self._targets()
+        table = torch.tensor(self._columns(), device=device).unbind(1)
+        self._low, self._high, *self._limits = (column.contiguous() for column in table)
+        self._push_bounds = bounds([config.push_interval, *[config.push_velocity] * 2], device)
         self.draw(torch.ones(num_worlds, dtype=torch.bool, device=device))
 
-    def _uniform(self, bounds: list[float], shape: torch.Size) -> Tensor:
-        sample = torch.rand(shape, device=self.actuator_delay.device, generator=self._generator)
-        return sample.mul_(bounds[1] - bounds[0]).add_(bounds[0])
+    def _targets(self) -> list[Tensor]:
+        """What :meth:`draw` draws, each (N, width)."""
+        drawn = [getattr(self._engine_params, name) for name in ENGINE_DRAWS]
+        drawn += [self.actuator_delay, self._until_push]
+        drawn += [getattr(self._ball_params, name) for name in BALL_DRAWS]
+        return [target if target.dim() == 2 else target.unsqueeze(-1) for target in drawn]
+
+    def _columns(self) -> list[tuple[float, float, float, float]]:
+        """For each column of :meth:`_targets` the ends of its range, and the limits within which draws are kept."""
+        names, free = (*ENGINE_DRAWS, "actuator_delay", "push_interval"), (-float("inf"), float("inf"))
+        rows = [(*getattr(self.config, name), *free) for name in names]
+        for name, (range_name, scales) in BALL_DRAWS.items():
+            nominal, ends = self._nominal_ball[name], getattr(self.config, range_name)
+            low, high = (end * nominal if scales else end + nominal for end in ends)
+            rows.append((low, high, *BALL_LIMITS.get(name, (0.0, float("inf")))))
+        widths = [target.shape[1] for target in self._drawn]
+        return [row for row, width in zip(rows, widths, strict=True) for _ in range(width)]
 
     def draw(self, mask: Tensor) -> None:
         """Draw new parameters for the worlds of ``mask`` (N,) bool."""
-        for name in ENGINE_DRAWS:
-            self._assign(mask, getattr(self._engine_params, name), getattr(self.config, name))
-        self._assign(mask, self.actuator_delay, self.config.actuator_delay)
-        self._assign(mask, self._until_push, self.config.push_interval)
-        for name, (range_name, scales) in BALL_DRAWS.items():
-            target: Tensor = getattr(self._ball_params, name)
-            sample = self._uniform(getattr(self.config, range_name), target.shape)
-            sample = sample.mul_(self._nominal_ball[name]) if scales else sample.add_(self._nominal_ball[name])
-            low, high = BALL_LIMITS.get(name, (0.0, float("inf")))
-            target.copy_(torch.where(mask, sample.clamp_(low, high), target))
-
-    def _assign(self, mask: Tensor, target: Tensor, bounds: list[float]) -> None:
-        wide = mask if target.dim() == 1 else mask.unsqueeze(-1)
-        target.copy_(torch.where(wide, self._uniform(bounds, target.shape), target))
+        sample = uniform(self._generator, self._low, self._high, mask.shape[0]).clamp_(*self._limits)
+        wide = mask.unsqueeze(-1)
+        for target, drawn in zip(self._drawn, sample.split([t.shape[1] for t in self._drawn], dim=1), strict=True):
+            torch.where(wide, drawn, target, out=target)
 
     def update_push(self) -> Tensor:
         """Advance the push timers by one control step; return ``push`` (N, nv), zero where no push is due."""
         self._until_push -= self._control_dt
         due = self._until_push < 0.0
-        self._assign(due, self._until_push, self.config.push_interval)
-        sample = self._uniform(self.config.push_velocity, self.push[:, :2].shape)
-        self.push[:, :2] = sample * due.unsqueeze(-1)
+        sample = uniform(self._generator, *self._push_bounds, due.shape[0])
+        torch.where(due, sample[:, 0], self._until_push, out=self._until_push)
+        torch.mul(sample[:, 1:], due.unsqueeze(-1), out=self.push[:, :2])
         return self.push
 
     def state_dict(self) -> dict[str, Tensor]:

@@ -167,6 +167,11 @@ class Sensing:
         self._mask = torch.zeros(num_worlds, dtype=torch.bool, device=device)
         self._bound: tuple[RobotState, Tensor] | None = None
 
+    @property
+    def delay(self) -> Tensor:
+        """(N,) control steps by which motion capture is late in each world."""
+        return self._delay
+
     def update(self, robot: RobotState, ball_position: Tensor, new_ball: Tensor) -> None:
         """One control step later: sense the state; ``new_ball`` (N,) bool marks balls that were just launched."""
         self._prepare(robot, ball_position, new_ball)

@@ -6,8 +6,9 @@ from torch import Tensor
 
 
 def _owned(owner: object) -> dict[str, Tensor]:
-    """Tensors that are attributes of ``owner``, without views of others."""
-    return {n: value for n, value in vars(owner).items() if isinstance(value, Tensor) and not value._is_view()}
+    """Tensors that are attributes of ``owner``, without views of others and the mask that a call was given."""
+    tensors = {name: value for name, value in vars(owner).items() if isinstance(value, Tensor) and name != "_mask"}
+    return {name: value for name, value in tensors.items() if not value._is_view()}
 
 
 def snapshot(owner: object) -> dict[str, Tensor]:

@@ -208,8 +208,9 @@ class Worlds:
         torch.div(events.paddle_impulse, self.control_dt, out=self._reaction)
         self.kinematics.paddle_generalized_force(self._reaction, self._reaction_point, self._applied)
 
-    def _observe(self) -> None:
-        self.kinematics.update(self.engine.qpos_path, self.engine.qvel_path)
+    def _observe(self, mask: Tensor | None = None) -> None:
+        """Derive ``robot`` from the engine's paths; ``mask`` (N,) bool: the worlds in which they are new."""
+        self.kinematics.update(self.engine.qpos_path, self.engine.qvel_path, mask)
         self._derive()
 
     def _update_delay(self) -> None:
@@ -225,16 +226,16 @@ class Worlds:
         self.engine.apply_params(mask)
         self.engine.reset(mask, qpos, qvel)
         wide = mask.unsqueeze(-1)
-        self._previous_targets.copy_(torch.where(wide, qpos[:, 7:], self._previous_targets))
+        torch.where(wide, qpos[:, 7:], self._previous_targets, out=self._previous_targets)
         self.ball.events.paddle_impulse.masked_fill_(wide, 0.0)
-        self._observe()
+        self._observe(mask)
 
     def serve(self, mask: Tensor, position: Tensor, velocity: Tensor, spin: Tensor) -> None:
         """Start the ball of the worlds of ``mask`` at position (N, 3) m, velocity (N, 3) m/s, spin (N, 3) rad/s."""
         wide = mask.unsqueeze(-1)
         states = (self.ball.position, self.ball.velocity, self.ball.spin)
         for target, value in zip(states, (position, velocity, spin), strict=True):
-            target.copy_(torch.where(wide, value, target))
+            torch.where(wide, value, target, out=target)
 
     def warn_of_overflow(self) -> None:
         """Warn, once, when a world ever had more contacts or constraints than there is room for: the engine has dropped

@@ -1,6 +1,7 @@
-"""``python -m pace.studies``: engines against each other, step sizes, solver settings, paddle reaction (extra ``dev``).
+"""``python -m pace.studies``: engines against each other, step sizes, solver settings, paddle reaction, and what a
+predictor can know (extra ``dev``).
 
-Prints the tables of ``docs/engines.md`` and ``docs/physics.md`` and writes their figures.
+Prints the tables of ``docs/engines.md``, ``docs/physics.md`` and ``docs/predictor.md`` and writes their figures.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
 
-from pace.studies import parity, reaction, steps
+from pace.studies import parity, predictor, reaction, steps
 from pace.studies.swings import Swings, policy_swings, random_swings
 
 
@@ -56,7 +57,22 @@ def study_solver(options: argparse.Namespace) -> None:
     print(steps.table(steps.solver_cases(_swings(options).windows(steps.LENGTH))))
 
 
-STUDIES = {"reaction": study_reaction, "parity": study_parity, "steps": study_steps, "solver": study_solver}
+def study_predictor(options: argparse.Namespace) -> None:
+    found = []
+    for case in options.cases or predictor.CASES:
+        found.append(predictor.compare(case, options.serves, options.predictors))
+        print(f"{case}: done", flush=True)
+    print(predictor.table(found))
+    _save(options.out, "predictor", (9.5, 3.6), lambda figure: predictor.draw(found, figure))
+
+
+STUDIES = {
+    "reaction": study_reaction,
+    "parity": study_parity,
+    "steps": study_steps,
+    "solver": study_solver,
+    "predictor": study_predictor,
+}
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -65,6 +81,10 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("studies", nargs="*", choices=[*STUDIES, []], help="which; none: all")
     parser.add_argument("--worlds", type=int, default=16, help="worlds of each case")
     parser.add_argument("--run", type=Path, help="run folder or checkpoint whose swings to replay; none: random swings")
+    parser.add_argument("--serves", type=int, default=128, help="predictor: serves of each case")
+    parser.add_argument("--cases", nargs="*", choices=list(predictor.CASES), help="predictor: which; none: all")
+    beside = "predictor: runs or checkpoints to measure beside the bounds"
+    parser.add_argument("--predictors", nargs="*", type=Path, default=[], help=beside)
     parser.add_argument("--out", type=Path, default=Path("docs/figures"), help="folder of the figures")
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import sys
 from pathlib import Path
 
@@ -11,6 +13,7 @@ import torch
 
 from pace.command import run_command
 from pace.config import TrainConfig, compose, parse
+from pace.predictor.regression import PredictorTrainer
 from pace.predictor.train import ServePractice, train_predictor
 from pace.rl.checkpoint import load_checkpoint
 
@@ -40,6 +43,26 @@ def test_practice_senses_the_true_ball_when_sensing_is_clean() -> None:
     newest = practice.predictor_input[:, -3:]
     torch.testing.assert_close(newest, practice.ball.position)
     assert (newest - practice.predictor_input[:, -6:-3]).norm(dim=1).min().item() > 0.05
+
+
+def test_the_learning_rate_falls_and_a_stop_keeps_what_was_learned(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rates: list[float] = []
+    fit = PredictorTrainer.update
+
+    def update(trainer: PredictorTrainer) -> dict[str, float]:
+        rates.append(trainer.optimiser.param_groups[0]["lr"])
+        if len(rates) == 3:
+            os.kill(os.getpid(), signal.SIGINT)
+        return fit(trainer)
+
+    monkeypatch.setattr(PredictorTrainer, "update", update)
+    overrides = ["num_worlds=64", "samples=3072", "minutes=0", "progress=false", "predictor.batches_per_update=2"]
+    monkeypatch.setattr(sys, "argv", ["train", f"run_dir={tmp_path}", *overrides])
+    assert run_command(train_predictor, "predictor_train") == 0
+    assert load_checkpoint(tmp_path).counters["updates"] == 3
+    assert rates == pytest.approx([0.004, 0.00342, 0.00202], rel=0.01)
 
 
 def test_command_trains_and_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

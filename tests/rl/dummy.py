@@ -104,6 +104,9 @@ class DummyTask:
         bad = (~torch.isfinite(self.policy_observation)).any(1).nonzero()
         return f"term position of world {int(bad[0])}" if len(bad) else None
 
+    def warn_of_overflow(self) -> None:
+        """Nothing can overflow here."""
+
     def pop_statistics(self) -> dict[str, Tensor]:
         popped = self.statistics
         self._clear_statistics()

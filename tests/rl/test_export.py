@@ -139,6 +139,7 @@ class TorchSession:
     [
         ("observation=paper", "predictor=paper", "reward=paper"),
         ("predictor.enabled=false", "observation.policy_history=1"),
+        ("predictor=filter",),
     ],
 )
 def test_other_tasks_have_their_own_graph(overrides: tuple[str, ...]) -> None:

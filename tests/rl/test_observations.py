@@ -274,7 +274,7 @@ def privileged(env: TableTennisEnv) -> dict[str, Tensor]:
     for name, part in vars(env.game).items():
         found |= {f"game.{name}.{key}": value for key, value in _tensors(part).items() if key != "idle_point"}
     found |= {f"reward.{name}": value for name, value in _tensors(env.rewards).items()}
-    for name in ("something_to_hit", "lost", "base_error", "foot_load", "foot_contact", "joint_power"):
+    for name in ("something_to_hit", "lost", "base_error", "foot_load", "foot_contact"):
         found[f"state.{name}"] = getattr(env.task_state, name)
     return found | {"truncated": env.truncated, "outcome": env.serve_outcome}
 

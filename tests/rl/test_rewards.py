@@ -12,7 +12,7 @@ import torch
 
 from pace.config import ConfigError, RewardConfig, RewardTerm
 from pace.rl.rewards import TERMS, RewardFunction, RewardManager
-from pace.rl.state import TaskState
+from pace.rl.state import JOINT_GROUPS, TaskState
 from tests.rl.fakes import CPU, JOINT_NAMES, config, fake_state, set_events
 
 PAPER_TASK = config("reward=paper")
@@ -43,6 +43,38 @@ def play(state: TaskState, distance: float, **times: Any) -> None:
 def test_every_term_of_the_paper_is_there_and_every_term_is_tested() -> None:
     assert set(PACE.terms) == set(TERMS)
     assert set(PACE.terms) - set(PAPER.terms) == {"arrival", "return_velocity"}
+
+
+def test_measures_are_the_torch_formulas_on_random_states() -> None:
+    torch.manual_seed(2)
+    state = fake_state(7, PAPER_TASK)
+    robot = state.robot
+    for tensor in (*vars(robot).values(), state.action, state.previous_action):
+        tensor.normal_(std=2.0)
+    robot.foot_force[0, 0] = torch.tensor([0.1, 0.2, 0.3])  # less than a contact
+    state.refresh()
+    action = state.action - state.previous_action
+    watts, deviation = robot.joint_torque * robot.joint_velocity, (robot.joint_position - state.nominal).abs()
+    groups = {
+        name: torch.tensor([float(belongs(joint)) for joint in JOINT_NAMES]) for name, belongs in JOINT_GROUPS.items()
+    }
+    horizontal = robot.foot_force[..., :2].norm(dim=-1) / robot.foot_force[..., 2].abs()
+    expected = {
+        "joint_power": watts.norm(dim=1),
+        "ankle_power": (watts * groups["ankles"]).norm(dim=1),
+        "joint_acceleration": robot.joint_acceleration.square().sum(1),
+        "action_change": action.square().sum(1),
+        "foot_tilt": robot.foot_up[..., :2].square().sum((1, 2)),
+        "foot_slide": (robot.foot_velocity[..., :2].norm(dim=-1) * state.foot_contact).sum(1),
+        "foot_steepness": (horizontal * state.foot_contact).amax(1),
+        "paddle_to_head": (robot.paddle_position - robot.head_position).norm(dim=1),
+    }
+    expected |= {name: deviation @ groups[name] for name in groups if name != "ankles"}
+    assert state.measures.keys() == expected.keys()
+    assert state.foot_contact.any()
+    assert not state.foot_contact.all()
+    for name, numbers in expected.items():
+        torch.testing.assert_close(state.measures[name], numbers)
 
 
 def test_paddle_to_target() -> None:
@@ -131,7 +163,9 @@ def test_return_velocity() -> None:
     events.hit_velocity_out[:] = good
     assert value("return_velocity", state, PACE) == pytest.approx(1.0, abs=1e-6)
     events.hit_velocity_out[:] = good + torch.tensor([-2.0, 1.0, -2.0])  # 3 m/s off
-    assert value("return_velocity", state, PACE) == pytest.approx(math.exp(-1.0), rel=1e-5)
+    assert value("return_velocity", state, PACE) == pytest.approx(1.0 - 3.0 / 8.0, rel=1e-5)
+    events.hit_velocity_out[:] = torch.tensor([-3.0, 0.0, -2.0])
+    assert value("return_velocity", state, PACE) == 0.0
     play(state, 0.5)
     assert value("return_velocity", state, PACE) == 0.0  # once
 

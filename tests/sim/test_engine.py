@@ -105,6 +105,14 @@ def test_native_is_mj_step_bit_by_bit():
         np.testing.assert_array_equal(engine.joint_torque[1], data.actuator_force.astype(np.float32))
 
 
+def test_native_stops_mujocos_timers():
+    _, model = build("native")
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data)
+    assert all(timer.duration == 0.0 for timer in data.timer)
+    assert data.timer[mujoco.mjtTimer.mjTIMER_STEP].number == 1
+
+
 def test_path_begins_where_the_last_one_ended_plus_the_push(fresh):
     engine, _ = fresh
     engine.advance(hold(engine), STILL)

@@ -89,6 +89,7 @@ def test_paddle_pose_of_a_sensed_state(path, kinematics):
 def test_generalized_force_is_the_jacobian_transpose(model, path, kinematics):
     generator = torch.Generator().manual_seed(1)
     force = torch.randn(WORLDS, 3, generator=generator) * 20
+    force[0] = 0.0
     point = kinematics.paddle_path[:, -1, :3] + 0.05 * torch.randn(WORLDS, 3, generator=generator)
     out = torch.full((WORLDS, model.nv), torch.nan)
     kinematics.paddle_generalized_force(force, point, out)
@@ -110,6 +111,22 @@ def test_outputs_stay_the_same_tensors(model, path):
     kinematics.update(*tensors)
     torch.testing.assert_close(kinematics.paddle_path[..., 0], first[..., 0] + 1.0)
     assert before == [kinematics.paddle_path.data_ptr(), kinematics.foot_up.data_ptr()]
+
+
+def test_masked_worlds_are_updated_alone(model, path):
+    kinematics = Kinematics(model, WORLDS, SUBSTEPS, "cpu")
+    tensors = [torch.tensor(p, dtype=torch.float32) for p in path]
+    kinematics.update(*tensors)
+    outputs = (kinematics.paddle_path, kinematics.foot_position, kinematics.head_position)
+    before = [output.clone() for output in outputs]
+    tensors[0][:, :, 0] += 1.0
+    mask = torch.tensor([False, True] * (WORLDS // 2))
+    kinematics.update(*tensors, mask)
+    for old, new in zip(
+        before, (kinematics.paddle_path, kinematics.foot_position, kinematics.head_position), strict=True
+    ):
+        moved = (new - old)[..., 0].reshape(WORLDS, -1).mean(1)
+        torch.testing.assert_close(moved, mask.float())
 
 
 def test_wrong_shapes_and_order_are_clear_errors(model):

@@ -1,0 +1,107 @@
+"""What reward terms measure on robots, as a Warp kernel, one thread a world. See :mod:`pace.rl.state`."""
+
+import warp as wp
+
+
+@wp.struct
+class RobotArrays:
+    """Tensors of :class:`pace.sim.worlds.RobotState`, and the actions."""
+
+    joint_velocity: wp.array2d[wp.float32]
+    joint_acceleration: wp.array2d[wp.float32]
+    joint_torque: wp.array2d[wp.float32]
+    joint_position: wp.array2d[wp.float32]
+    foot_force: wp.array2d[wp.vec3]
+    foot_velocity: wp.array2d[wp.vec3]
+    foot_up: wp.array2d[wp.vec3]
+    paddle_position: wp.array[wp.vec3]
+    head_position: wp.array[wp.vec3]
+    action: wp.array2d[wp.float32]
+    previous_action: wp.array2d[wp.float32]
+
+
+@wp.struct
+class JointArrays:
+    """Per joint: its nominal position, rad, and 1 where it belongs to a group of :data:`pace.rl.state.JOINT_GROUPS`."""
+
+    nominal: wp.array[wp.float32]
+    ankles: wp.array[wp.float32]
+    hip_waist_left_arm: wp.array[wp.float32]
+    left_shoulder_roll: wp.array[wp.float32]
+    right_arm: wp.array[wp.float32]
+
+
+@wp.struct
+class Measures:
+    """Results, tensors of :class:`pace.rl.state.TaskState`."""
+
+    joint_power: wp.array[wp.float32]
+    ankle_power: wp.array[wp.float32]
+    joint_acceleration: wp.array[wp.float32]
+    action_change: wp.array[wp.float32]
+    hip_waist_left_arm: wp.array[wp.float32]
+    left_shoulder_roll: wp.array[wp.float32]
+    right_arm: wp.array[wp.float32]
+    foot_tilt: wp.array[wp.float32]
+    foot_slide: wp.array[wp.float32]
+    foot_steepness: wp.array[wp.float32]
+    paddle_to_head: wp.array[wp.float32]
+
+
+@wp.func
+def _measure_joints(robot: RobotArrays, joints: JointArrays, measures: Measures, world: int):
+    power = wp.float32(0.0)
+    ankle_power = wp.float32(0.0)
+    acceleration = wp.float32(0.0)
+    change = wp.float32(0.0)
+    middle = wp.float32(0.0)
+    left_roll = wp.float32(0.0)
+    right = wp.float32(0.0)
+    for joint in range(joints.nominal.shape[0]):
+        watts = robot.joint_torque[world, joint] * robot.joint_velocity[world, joint]
+        power += watts * watts
+        ankle_power += joints.ankles[joint] * watts * watts
+        acceleration += robot.joint_acceleration[world, joint] * robot.joint_acceleration[world, joint]
+        step = robot.action[world, joint] - robot.previous_action[world, joint]
+        change += step * step
+        deviation = wp.abs(robot.joint_position[world, joint] - joints.nominal[joint])
+        middle += joints.hip_waist_left_arm[joint] * deviation
+        left_roll += joints.left_shoulder_roll[joint] * deviation
+        right += joints.right_arm[joint] * deviation
+    measures.joint_power[world] = wp.sqrt(power)
+    measures.ankle_power[world] = wp.sqrt(ankle_power)
+    measures.joint_acceleration[world] = acceleration
+    measures.action_change[world] = change
+    measures.hip_waist_left_arm[world] = middle
+    measures.left_shoulder_roll[world] = left_roll
+    measures.right_arm[world] = right
+
+
+@wp.func
+def _horizontal(vector: wp.vec3) -> wp.vec2:
+    return wp.vec2(vector[0], vector[1])
+
+
+@wp.func
+def _measure_feet(robot: RobotArrays, contact: wp.array2d[wp.bool], measures: Measures, world: int):
+    tilt = wp.float32(0.0)
+    slide = wp.float32(0.0)
+    steepness = wp.float32(0.0)
+    for foot in range(2):
+        tilt += wp.length_sq(_horizontal(robot.foot_up[world, foot]))
+        if contact[world, foot]:
+            force = robot.foot_force[world, foot]
+            slide += wp.length(_horizontal(robot.foot_velocity[world, foot]))
+            steepness = wp.max(steepness, wp.length(_horizontal(force)) / wp.abs(force[2]))
+    measures.foot_tilt[world] = tilt
+    measures.foot_slide[world] = slide
+    measures.foot_steepness[world] = steepness
+
+
+@wp.kernel
+def measure(robot: RobotArrays, joints: JointArrays, foot_contact: wp.array2d[wp.bool], measures: Measures):
+    """Sums over the joints and feet of one world."""
+    world = wp.tid()
+    _measure_joints(robot, joints, measures, world)
+    _measure_feet(robot, foot_contact, measures, world)
+    measures.paddle_to_head[world] = wp.length(robot.paddle_position[world] - robot.head_position[world])

@@ -1,0 +1,138 @@
+"""What can be known of the apex of a serve, and what predictors make of it, by time before the apex."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from pace.config import TrainConfig, compose, parse
+from pace.predictor.regression import BIN_NAMES, TIME_BINS
+from pace.rl.loading import load_predictor
+from pace.studies.common import COLOURS, markdown
+from pace.studies.flights import Recording, record
+from pace.studies.posterior import Question, answer
+
+FRAMES = 46  # control steps, 0.9 s: past the apex of every serve
+CHAINS, STEPS = 4, 900
+PREDICTED_SERVES = 1024
+SEED = 5
+#: What is known at a time: so many of the last sensed positions.
+WINDOWS = {"bound, five positions": 5, "bound, whole flight": FRAMES}
+#: Name -> ball preset, randomisation and sensing.
+CASES = {
+    "rubber": ("rubber", "full", "paper"),
+    "paper": ("paper", "full", "paper"),
+    "standard": ("standard", "full", "paper"),
+    "venue": ("venue", "full", "paper"),
+    "all (wide)": ("rubber", "wide", "paper"),
+    "paper, as published": ("paper", "paper", "paper"),
+    "rubber, ball known": ("rubber", "none", "paper"),
+    "rubber, clean": ("rubber", "full", "clean"),
+    "paper, clean": ("paper", "full", "clean"),
+    "standard, clean": ("standard", "full", "clean"),
+    "venue, clean": ("venue", "full", "clean"),
+    "rubber, ball known, clean": ("rubber", "none", "clean"),
+}
+DRAWN = ("rubber", "rubber, ball known")
+BEFORE_APEX = BIN_NAMES[1:]
+
+
+@dataclass(frozen=True)
+class Errors:
+    """RMSE of the apex (3-D, cm) of each bound and predictor, by ``BEFORE_APEX``, NaN where no serve was asked."""
+
+    case: str
+    rmse: dict[str, list[float]]
+
+
+def case_config(case: str, serves: int) -> TrainConfig:
+    """The task of ``CASES[case]`` with the evaluation's mixed serves."""
+    ball, randomization, sensing = CASES[case]
+    overrides = [f"ball={ball}", f"randomization={randomization}", f"sensing={sensing}", "serve=mixed"]
+    return parse(compose("predictor_train", [*overrides, f"num_worlds={serves}", f"seed={SEED}"]), TrainConfig)
+
+
+def compare(case: str, serves: int, runs: Sequence[Path] = ()) -> Errors:
+    """Bounds, at one instant of each of ``serves`` serves in each bin, and the predictors of ``runs``, at every instant
+    of PREDICTED_SERVES."""
+    config = case_config(case, serves)
+    recording = record(config, FRAMES)
+    instants = instants_of(recording)
+    rmse = {name: [_bound(config, recording, at, frames) for at in instants] for name, frames in WINDOWS.items()}
+    return Errors(case, rmse | {run.name: predicted_rmse(case, run) for run in runs})
+
+
+@torch.no_grad()
+def predicted_rmse(case: str, run: Path) -> list[float]:
+    """RMSE (cm) of a saved predictor by ``BEFORE_APEX``."""
+    predictor = load_predictor(run)
+    config = dataclasses.replace(case_config(case, PREDICTED_SERVES), predictor=predictor.config)
+    recording = record(config, FRAMES, predictor.network)
+    error = recording.predicted - recording.apex.unsqueeze(1)
+    bins = _bins(recording)
+    return [_rmse(error[recording.valid & (bins == number)]) for number in range(1, len(BIN_NAMES))]
+
+
+def _bins(recording: Recording) -> Tensor:
+    return torch.bucketize(recording.time_to_apex.contiguous(), torch.tensor(TIME_BINS), right=True)
+
+
+def instants_of(recording: Recording) -> list[Tensor]:
+    """For each of ``BEFORE_APEX`` a random control step of every serve (N,) in that bin; -1 where it has none."""
+    generator = torch.Generator().manual_seed(SEED)
+    bins = _bins(recording)
+    found = []
+    for number in range(1, len(BIN_NAMES)):
+        suits = recording.valid & (bins == number)
+        draw = torch.rand(suits.shape, generator=generator) * suits
+        found.append(torch.where(suits.any(1), draw.argmax(1), -1))
+    return found
+
+
+def _bound(config: TrainConfig, recording: Recording, instants: Tensor, frames: int) -> float:
+    """RMSE of the posterior mean from the last ``frames`` positions at ``instants`` (N,)."""
+    chosen = instants >= 0
+    if not chosen.any():
+        return float("nan")
+    now = instants[chosen].unsqueeze(1)
+    step = torch.arange(int(now.max()) + 1)
+    used = (step <= now) & (step > now - frames)
+    question = Question(recording.cube[chosen], recording.sensed[chosen, : len(step)], used)
+    return _rmse(answer(config, question, CHAINS, STEPS).mean - recording.apex[chosen])
+
+
+def _rmse(error: Tensor) -> float:
+    return 100.0 * float(error.square().sum(1).mean().sqrt()) if len(error) else float("nan")
+
+
+def table(found: Sequence[Errors]) -> str:
+    """A row for each case and bound or predictor."""
+    bins = [name.replace("_", " to ").replace("over to", "over").replace("s", " s") for name in BEFORE_APEX]
+    rows = [
+        [errors.case, name, *(f"{value:.2f}" for value in values)]
+        for errors in found
+        for name, values in errors.rmse.items()
+    ]
+    return markdown(["ball", "RMSE (cm) before the apex", *bins], rows)
+
+
+def draw(found: Sequence[Errors], figure: Figure) -> None:
+    """RMSE over the time before the apex in the cases of DRAWN."""
+    middle = np.array([0.05, 0.15, 0.25, 0.35, 0.5])
+    shown = [errors for errors in found if errors.case in DRAWN] or list(found[:1])
+    panels = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
+    for axes, errors in zip(panels, shown, strict=True):
+        for (name, values), colour in zip(errors.rmse.items(), COLOURS, strict=False):
+            style = "--" if name in WINDOWS else "o-"
+            axes.plot(middle, values, style, color=colour, lw=1.5, ms=4, label=name)
+        axes.set(xlabel="time before the apex (s)", title=errors.case, ylim=(0, None))
+        axes.invert_xaxis()
+    panels[0].set_ylabel("RMSE of the apex (cm)")
+    panels[0].legend(frameon=False, fontsize=8)
