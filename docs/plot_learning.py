@@ -6,67 +6,41 @@ prototype that the recipe started from); writes ``docs/figures/learning.png`` an
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
 import matplotlib
-import numpy as np
-from numpy.typing import NDArray
+
+from pace.rl.milestones import Curve, Milestone, markdown, passage, read_curve
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
 HERE = Path(__file__).resolve().parent
-WINDOW = 250_000  # samples that a point of a curve averages over
-#: Milestone -> (column, value, whether the curve has to fall below it).
-MILESTONES = {
-    "falls < 0.1 /s": ("fall", 0.1, True),
-    "hits 10 %": ("hit", 0.10, False),
-    "hits 50 %": ("hit", 0.50, False),
-    "hits 80 %": ("hit", 0.80, False),
-    "returns 10 %": ("success", 0.10, False),
-    "returns 50 %": ("success", 0.50, False),
-}
-#: Column of a curve -> its name in metrics.csv and in prototype.csv.
-COLUMNS = {"samples": ("samples", "samples"), "hit": ("hit_rate", "hit"), "success": ("success_rate", "succ")}
-COLUMNS |= {"fall": ("fall_rate", "fallps")}
-
-Curve = dict[str, NDArray[np.float64]]
-
-
-def read(path: Path, prototype: bool) -> Curve:
-    """Columns samples, hit, success, fall of a CSV, averaged over windows of ``WINDOW`` samples."""
-    with path.open() as file:
-        rows = list(csv.DictReader(file))
-    raw = {name: np.array([float(row[names[prototype]] or "nan") for row in rows]) for name, names in COLUMNS.items()}
-    bins = (raw["samples"] / WINDOW).astype(int)
-    return {name: np.array([np.nanmean(values[bins == b]) for b in np.unique(bins)]) for name, values in raw.items()}
-
-
-def reached(curve: Curve, column: str, value: float, below: bool) -> str:
-    """Samples (M) at which the curve crosses ``value`` for good enough, or a dash.
-
-    For a curve that has to fall, its start does not count: robots that were just reset have not fallen yet.
-    """
-    fine = (curve[column] < value) & (curve["samples"] > 1e6) if below else curve[column] >= value
-    return f"{curve['samples'][fine.argmax()] / 1e6:.1f}" if fine.any() else "-"
+MILESTONES = (
+    Milestone("falls", 0.1),
+    *(Milestone("hits", value) for value in (0.1, 0.5, 0.8)),
+    *(Milestone("returns", value) for value in (0.1, 0.5)),
+)
+PROTOTYPE = {"hits": "hit", "returns": "succ", "falls": "fallps"}  # its columns
 
 
 def print_table(curves: dict[str, Curve]) -> None:
     """Millions of samples to each milestone, as Markdown."""
-    print("| M samples to | " + " | ".join(curves) + " |\n|---|" + "---|" * len(curves))
-    for milestone, condition in MILESTONES.items():
-        print(f"| {milestone} | " + " | ".join(reached(curve, *condition) for curve in curves.values()) + " |")
+    rows = []
+    for milestone in MILESTONES:
+        found = [passage(curve, milestone) for curve in curves.values()]
+        rows.append([milestone.label, *(f"{place.samples / 1e6:.1f}" if place else "-" for place in found)])
+    print(markdown(["M samples to", *curves], rows))
 
 
 def plot(curves: dict[str, Curve], path: Path) -> None:
     """Hit, return and fall rates against samples."""
-    panels = (("hit", "hits"), ("success", "returns"), ("fall", "falls per second"))
     figure, axes = plt.subplots(1, 3, figsize=(13, 3.8), constrained_layout=True)
-    for axis, (column, title) in zip(axes, panels, strict=True):
+    for axis, rate in zip(axes, ("hits", "returns", "falls"), strict=True):
         for name, curve in curves.items():
             style = {"color": "0.5", "linestyle": "--"} if name == "prototype" else {}
-            axis.plot(curve["samples"] / 1e6, curve[column], label=name, **style)
+            axis.plot(curve.samples / 1e6, curve.rates[rate], label=name, **style)
+        title = "falls per second" if rate == "falls" else rate
         axis.set(title=title, xlabel="control steps (millions)", ylim=(0, 1))
         axis.grid(alpha=0.3)
     axes[0].legend()
@@ -76,8 +50,8 @@ def plot(curves: dict[str, Curve], path: Path) -> None:
 
 def main() -> None:
     """Read, print, plot."""
-    curves = {path.stem: read(path, False) for path in sorted((HERE / "learning").glob("seed*.csv"))}
-    curves["prototype"] = read(HERE / "learning" / "prototype.csv", True)
+    curves = {path.stem: read_curve(path) for path in sorted((HERE / "learning").glob("seed*.csv"))}
+    curves["prototype"] = read_curve(HERE / "learning" / "prototype.csv", columns=PROTOTYPE)
     print_table(curves)
     target = HERE / "figures" / "learning.png"
     target.parent.mkdir(exist_ok=True)

@@ -67,9 +67,14 @@ def name_argument(arguments: list[str], key: str) -> list[str]:
         after_option = index > 0 and arguments[index - 1] in HYDRA_OPTIONS
         plain = "=" not in argument or os.path.exists(argument)
         if plain and not after_option and not argument.startswith(("-", "~", "+")):
-            quoted = argument.replace("\\", "\\\\").replace("'", "\\'")
-            return [*arguments[:index], f"{key}='{quoted}'", *arguments[index + 1 :]]
+            return [*arguments[:index], f"{key}={quote(argument)}", *arguments[index + 1 :]]
     return arguments
+
+
+def quote(value: str) -> str:
+    """``value`` the way Hydra takes any text, such as a path with a ``=`` in it."""
+    escaped = value.replace("\\", "\\\\").replace("'", "\\'")
+    return f"'{escaped}'"
 
 
 def collect_overrides(arguments: list[str], groups: tuple[str, ...]) -> list[str]:

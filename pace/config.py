@@ -546,6 +546,31 @@ class PlayConfig:
             _require(value > 0 and value % 2 == 0, f"{name} must be an even number of pixels, got {value}")
 
 
+@dataclass
+class AblateConfig:
+    """``python -m pace.rl.ablate``: which experiments, with which seeds, and how long."""
+
+    experiments: list[str]  # names of configs/experiment/
+    seeds: list[int]
+    samples: float  # control steps of each run
+    jobs: int  # runs at a time
+    window: float  # control steps that a point of a curve averages over
+    run_dir: str
+    out: str | None  # null: run_dir
+    train: bool
+    overrides: list[str]  # of the training
+    progress: bool
+
+    def __post_init__(self) -> None:
+        for name in ("experiments", "seeds"):
+            values = getattr(self, name)
+            _require(len(values) > 0, f"{name} must name at least one")
+            _require(len(set(values)) == len(values), f"{name} names one twice: {values}")
+        for name in ("samples", "window"):
+            _require(getattr(self, name) > 0, f"{name} must be positive, got {getattr(self, name)}")
+        _require(self.jobs >= 1, f"jobs must be at least 1, got {self.jobs}")
+
+
 def parse(config: DictConfig | dict[str, Any], schema: type[T]) -> T:
     """Check ``config`` against a dataclass and return an instance of it.
 

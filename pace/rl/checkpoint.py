@@ -136,7 +136,7 @@ def load_checkpoint(path: str | Path, weights_only: bool = False) -> Checkpoint:
     Errors: :class:`CheckpointError` for a missing or truncated file, another format number or a missing tensor.
     """
     folder = find_checkpoint(path)
-    meta = _read_meta(folder / META)
+    meta = read_meta(folder)
     weights = restore_tensors(meta["weights"], _read_tensors(folder / WEIGHTS), folder / WEIGHTS)
     training = None
     if meta["training"] is not None and not weights_only:
@@ -144,7 +144,12 @@ def load_checkpoint(path: str | Path, weights_only: bool = False) -> Checkpoint:
     return Checkpoint(meta["config"], meta["counters"], weights, training, folder)
 
 
-def _read_meta(file: Path) -> dict[str, Any]:
+def read_meta(folder: Path) -> dict[str, Any]:
+    """What ``checkpoint.json`` of a checkpoint holds: config, counters and places of the tensors, which stay unread.
+
+    Errors: :class:`CheckpointError` for a file that cannot be read, has another format number or lacks a part.
+    """
+    file = folder / META
     try:
         meta = json.loads(file.read_text())
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:

@@ -18,6 +18,7 @@ from torchrl.record.loggers.tensorboard import TensorboardLogger
 
 from pace.config import ConfigError
 from pace.rl.checkpoint import list_checkpoints
+from pace.rl.milestones import read_metrics
 
 CONFIG, VERSIONS, METRICS, CURVE = "config.yaml", "versions.json", "metrics.csv", "learning_curve.png"
 PACKAGES = ("torch", "torchrl", "tensordict", "mujoco", "mujoco-warp", "warp-lang", "numpy", "hydra-core")
@@ -141,13 +142,6 @@ def _cell(value: float) -> str:
     if math.isnan(value):
         return ""
     return str(int(value)) if float(value).is_integer() and abs(value) < 1e15 else f"{value:.6g}"
-
-
-def read_metrics(file: str | Path) -> dict[str, list[float]]:
-    """Columns of a ``metrics.csv``; an empty cell is NaN."""
-    with Path(file).open(newline="") as handle:
-        rows = list(csv.DictReader(handle))
-    return {name: [float(row[name] or "nan") for row in rows] for name in (rows[0] if rows else {})}
 
 
 def moving_average(values: list[float], window: int) -> list[float]:

@@ -23,10 +23,10 @@ from pace.config import ConfigError, load_train_config
 from pace.predictor.network import PredictorNetwork
 from pace.predictor.regression import PredictorTrainer
 from pace.rl.checkpoint import CheckpointError, load_checkpoint
+from pace.rl.milestones import read_metrics
 from pace.rl.policy import Agent, RunningNorm
 from pace.rl.ppo import PPO
 from pace.rl.rollout import Rollout
-from pace.rl.run_folder import read_metrics
 from pace.rl.trainer import Trainer, summarise
 from pace.team import Team, suitable_size
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from pace.rl.checkpoint import load_checkpoint
-from pace.rl.run_folder import read_metrics
+from pace.rl.milestones import read_metrics
 from pace.rl.train import main
 
 WORLDS = 8

@@ -15,8 +15,9 @@ from omegaconf import OmegaConf
 from pace.config import ConfigError, TrainConfig, load_train_config, parse, to_dict
 from pace.predictor.network import PredictorNetwork
 from pace.rl.checkpoint import CheckpointError, list_checkpoints, load_checkpoint
+from pace.rl.milestones import read_metrics
 from pace.rl.rollout import RolloutError
-from pace.rl.run_folder import RunFolder, read_metrics
+from pace.rl.run_folder import RunFolder
 from pace.rl.trainer import Trainer, summarise
 
 WORLDS = 64

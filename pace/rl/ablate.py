@@ -1,0 +1,168 @@
+"""``python -m pace.rl.ablate``: what each part of the recipe is worth (figure 6 of the paper).
+
+Examples::
+
+    python -m pace.rl.ablate                              # five experiments, three seeds each, one after another
+    python -m pace.rl.ablate jobs=2 out=docs/ablation     # two at once, each on half of the cores
+    python -m pace.rl.ablate experiments=[full,no_predictor] seeds=[7] samples=4e6 num_worlds=512
+    python -m pace.rl.ablate train=false out=docs/ablation    # table and figure again, from the CSVs that are there
+
+Called again, it skips runs that are finished and resumes those that are not.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from omegaconf import DictConfig
+
+from pace.command import run_command
+from pace.config import AblateConfig, TrainConfig, parse
+from pace.rl.checkpoint import CheckpointError
+from pace.rl.milestones import MILESTONES, Array, Curve, Milestone, markdown, passage, read_curve, write_slim
+from pace.rl.run_folder import METRICS
+from pace.rl.run_queue import Run, RunQueue, check_settings
+
+FIGURE = "ablation.png"
+DPI = 110
+OWN_KEYS = ("name", "seed", "samples", "minutes", "run_dir", "resume", "init_from", "progress")  # given to each run
+TRAINING_KEYS = tuple(key for key in TrainConfig.__dataclass_fields__ if key not in OWN_KEYS)
+Curves = dict[str, list[Curve]]  # of the seeds that there are, by experiment
+
+
+class AblationError(RuntimeError):
+    """Runs that failed, or nothing to draw; the message names them."""
+
+
+def main() -> int:
+    """Entry point; returns the exit status."""
+    return run_command(ablate_from_config, "ablate", (AblationError, CheckpointError), task_groups=TRAINING_KEYS)
+
+
+def ablate_from_config(composed: DictConfig) -> None:
+    """Train what is not trained yet, then write CSVs and figure and print the table.
+
+    Errors: :class:`AblationError`, after all that, when runs failed.
+    """
+    config = parse(composed, AblateConfig)
+    out = Path(config.out or config.run_dir)
+    failures: Mapping[str, str] = {}
+    if config.train:
+        failures = train(config, out)
+    curves = read_curves(config, out)
+    table = markdown(["M control steps to", *curves], milestone_rows(curves))
+    print(f"\n{table}\n\nwrote {draw(curves, out / FIGURE)}")
+    if failures:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in failures.items())
+        raise AblationError(f"{len(failures)} runs failed, the same command tries them again: {reasons}")
+
+
+def planned_runs(config: AblateConfig) -> list[Run]:
+    """One run for each experiment and seed; the first seed of all experiments comes first."""
+    folder = Path(config.run_dir)
+    return [
+        Run(
+            folder / run_name(experiment, seed),
+            (f"experiment={experiment}", f"seed={seed}", *config.overrides),
+            config.samples,
+        )
+        for seed in config.seeds
+        for experiment in config.experiments
+    ]
+
+
+def run_name(experiment: str, seed: int) -> str:
+    """Name of a run's folder and of its CSV."""
+    return f"{experiment}_seed{seed}"
+
+
+def train(config: AblateConfig, out: Path) -> Mapping[str, str]:
+    """Play the runs and write their CSVs into ``out``; returns the reasons of those that failed."""
+    runs = planned_runs(config)
+    for run in runs:
+        check_settings(run)
+    queue = RunQueue(runs, config.jobs, config.progress)
+    try:
+        queue.play()
+    except KeyboardInterrupt:
+        print(f"\nto go on: the same command; finished and saved runs are in {config.run_dir}", file=sys.stderr)
+        raise
+    out.mkdir(parents=True, exist_ok=True)
+    for run in runs:
+        if (run.folder / METRICS).exists():
+            print(f"wrote {write_slim(run.folder / METRICS, out / f'{run.name}.csv')}")
+    return queue.failures
+
+
+def read_curves(config: AblateConfig, out: Path) -> Curves:
+    """Curves of the CSVs in ``out``. Errors: :class:`AblationError` when there is none."""
+    files = {name: [out / f"{run_name(name, seed)}.csv" for seed in config.seeds] for name in config.experiments}
+    curves = {
+        name: [read_curve(file, config.window) for file in there if file.exists()] for name, there in files.items()
+    }
+    curves = {name: seeds for name, seeds in curves.items() if seeds}
+    if not curves:
+        raise AblationError(f"{out} has no CSV of {', '.join(config.experiments)}: nothing to draw")
+    return curves
+
+
+def milestone_rows(curves: Curves) -> list[list[str]]:
+    """Rows of the table: a milestone, and what each experiment needs for it."""
+    return [[milestone.label, *(needed(seeds, milestone) for seeds in curves.values())] for milestone in MILESTONES]
+
+
+def needed(seeds: Sequence[Curve], milestone: Milestone) -> str:
+    """Median and range over ``seeds`` of the millions of control steps to ``milestone``.
+
+    A seed that does not get there counts as one that needs more than all others.
+    """
+    found = [passage(curve, milestone) for curve in seeds]
+    reached = sorted(place.samples / 1e6 for place in found if place is not None)
+    middle = median([*reached, *[np.inf] * (len(seeds) - len(reached))])
+    text = f"{middle:.1f}" if np.isfinite(middle) else "-"
+    if not reached:
+        return "-"
+    if len(reached) < len(seeds):
+        return f"{text} ({len(reached)} of {len(seeds)} seeds)"
+    return f"{text} ({reached[0]:.1f} to {reached[-1]:.1f})" if len(seeds) > 1 else text
+
+
+def draw(curves: Curves, file: Path) -> Path:
+    """Hits and returns of each experiment: median and range over its seeds against millions of control steps."""
+    figure = Figure(figsize=(11, 4.2), layout="constrained")
+    for axes, rate in zip(figure.subplots(1, 2), ("hits", "returns"), strict=True):
+        for number, (name, seeds) in enumerate(curves.items()):
+            _draw_experiment(axes, f"C{number}", name.replace("_", " "), seeds, rate)
+        axes.set(xlabel="control steps, millions", ylabel=f"{rate}, % of serves")
+        axes.set_ylim(bottom=0)
+        axes.grid(alpha=0.3)
+    figure.axes[0].legend(loc="upper left")
+    figure.savefig(file, dpi=DPI)
+    return file
+
+
+def _draw_experiment(axes: Axes, color: str, name: str, seeds: Sequence[Curve], rate: str) -> None:
+    samples, values = over_seeds(seeds, rate)
+    label = f"{name} ({len(seeds)} seed{'s' if len(seeds) > 1 else ''})"
+    axes.plot(samples / 1e6, 100 * np.median(values, 0), color=color, label=label)
+    if len(seeds) > 1:
+        axes.fill_between(samples / 1e6, 100 * values.min(0), 100 * values.max(0), color=color, alpha=0.15, lw=0)
+
+
+def over_seeds(seeds: Sequence[Curve], rate: str) -> tuple[Array, Array]:
+    """Control steps (M,) that all ``seeds`` have got to, and their ``rate`` (S, M) there, interpolated."""
+    end = min((curve.samples[-1] for curve in seeds if len(curve.samples)), default=0.0)
+    samples = np.unique(np.concatenate([curve.samples for curve in seeds]))
+    samples = samples[samples <= end]
+    values = [np.interp(samples, curve.samples, curve.rates[rate]) for curve in seeds if len(curve.samples)]
+    return samples, np.array(values) if values else np.zeros((1, 0))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,178 @@
+"""When a run first stands, hits and returns: moving averages of its metrics, and the milestones that they pass."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+WINDOW = 250_000.0  # control steps that a point of a curve averages over: a thousand serves and more
+#: A rate of a curve -> its column in ``metrics.csv``: shares of the serves, and falls per second of a world's time.
+RATES = {"hits": "hit_rate", "returns": "success_rate", "falls": "fall_rate"}
+#: What a slim CSV keeps of ``metrics.csv``.
+SLIM_COLUMNS = (
+    "update", "samples", "wall_s", "hit_rate", "success_rate", "fall_rate", "serves", "predictor_rmse_cm",
+    "mean_reward", "kl", "lr", "policy_std",
+)  # fmt: skip
+SLIM_ROWS = 4  # rows of ``metrics.csv`` in one of a slim CSV
+_LAST = ("update", "samples", "wall_s")  # what counts from the start of a run: a slim row has its last value
+_SHARES = ("hit_rate", "success_rate")  # of the serves of a row
+
+
+@dataclass(frozen=True)
+class Milestone:
+    """A value that one of :data:`RATES` passes: falls come down to it, the others rise to it."""
+
+    rate: str
+    value: float
+
+    @property
+    def label(self) -> str:
+        """In words."""
+        if self.rate != "falls":
+            return f"{self.rate} {100 * self.value:.0f} %"
+        return "falls < 1/3 /s" if self.value == 1 / 3 else f"falls < {self.value:g} /s"
+
+
+MILESTONES = (
+    *(Milestone("falls", value) for value in (1 / 3, 0.1)),
+    *(Milestone("hits", value) for value in (0.1, 0.5, 0.9)),
+    *(Milestone("returns", value) for value in (0.1, 0.5, 0.8)),
+)
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Moving averages of a run, arrays (M,): ``samples`` in control steps, ``minutes`` of the clock, ``rates`` by name.
+
+    Points whose window is not full are left out; a rate is NaN where nothing was counted in the window.
+    """
+
+    samples: Array
+    minutes: Array
+    rates: Mapping[str, Array]
+
+
+@dataclass(frozen=True)
+class Passage:
+    """Where a curve first passes a milestone; ``at_start``: its first point is already beyond."""
+
+    samples: float
+    minutes: float
+    at_start: bool
+
+
+def read_metrics(file: str | Path, columns: Iterable[str] | None = None) -> dict[str, list[float]]:
+    """Columns of a ``metrics.csv``, all or those of ``columns`` that it has; an empty cell is NaN."""
+    with Path(file).open(newline="") as handle:
+        rows = list(csv.DictReader(handle))
+    names = [name for name in (rows[0] if rows else ()) if columns is None or name in set(columns)]
+    return {name: [float(row[name] or "nan") for row in rows] for name in names}
+
+
+def read_curve(file: str | Path, window: float = WINDOW, columns: Mapping[str, str] = RATES) -> Curve:
+    """The curve of a ``metrics.csv``, whole or slim, averaged over the last ``window`` control steps.
+
+    Shares are weighted by the serves of their rows where the file has them. ``columns``: names of the rates in it.
+    """
+    wanted = ("samples", "wall_s", "serves", *columns.values())
+    metrics = {name: np.array(values) for name, values in read_metrics(file, wanted).items()}
+    if not metrics:
+        return Curve(np.zeros(0), np.zeros(0), {rate: np.zeros(0) for rate in columns})
+    samples, steps = metrics["samples"], np.ones(len(metrics["samples"]))
+    full = _full_windows(samples, window)
+    rates = {}
+    for rate, column in columns.items():
+        weight = steps if rate == "falls" else metrics.get("serves", steps)
+        rates[rate] = _moving_mean(samples, metrics[column], weight, window)[full]
+    return Curve(samples[full], metrics["wall_s"][full] / 60.0, rates)
+
+
+def _full_windows(samples: Array, window: float) -> NDArray[np.bool_]:
+    """Where so many control steps have gone by; the first row is taken to be as long as the second."""
+    if len(samples) < 2:
+        return np.zeros(len(samples), dtype=bool)
+    began = 2.0 * samples[0] - samples[1]
+    return samples - began >= window
+
+
+def _moving_mean(samples: Array, values: Array, weight: Array, window: float) -> Array:
+    """Weighted mean of ``values`` over the rows within the last ``window`` control steps; NaN without weight."""
+    weight = np.where(np.isnan(values), 0.0, weight)
+    first = np.searchsorted(samples, samples - window, side="right")
+    end = np.arange(1, len(samples) + 1)
+
+    def windowed(summands: Array) -> Array:
+        total = np.concatenate([[0.0], np.cumsum(summands)])
+        return total[end] - total[first]
+
+    weights, sums = windowed(weight), windowed(np.nan_to_num(values) * weight)
+    return np.divide(sums, weights, out=np.full(len(samples), np.nan), where=weights > 0)
+
+
+def passage(curve: Curve, milestone: Milestone) -> Passage | None:
+    """Where ``curve`` first passes ``milestone``; None if it never does.
+
+    For falls, what comes before the most of them does not count: robots that were just reset have not fallen yet.
+    """
+    rate = curve.rates[milestone.rate]
+    if not np.isfinite(rate).any():
+        return None
+    if milestone.rate == "falls":
+        passed = rate < milestone.value
+        worst = int(np.nanargmax(rate))
+        if not passed[worst]:
+            passed[:worst] = False
+    else:
+        passed = rate >= milestone.value
+    if not passed.any():
+        return None
+    first = int(passed.argmax())
+    return Passage(float(curve.samples[first]), float(curve.minutes[first]), first == 0)
+
+
+def passage_text(found: Passage | None) -> str:
+    """Millions of control steps and, in brackets, minutes; a dash for a milestone that was not reached."""
+    if found is None:
+        return "-"
+    if found.at_start:
+        return "from the start"
+    return f"{found.samples / 1e6:.1f} ({found.minutes:.0f})"
+
+
+def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def write_slim(source: str | Path, target: str | Path, every: int = SLIM_ROWS) -> Path:
+    """Write the :data:`SLIM_COLUMNS` that ``source`` has, ``every`` rows pooled into one, so that no serve is lost."""
+    metrics = read_metrics(source, SLIM_COLUMNS)
+    names = [name for name in SLIM_COLUMNS if name in metrics]
+    count = len(metrics.get("samples", ()))
+    with Path(target).open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(names)
+        for start in range(0, count, every):
+            block = {name: np.array(metrics[name][start : start + every]) for name in names}
+            writer.writerow(f"{_pooled(name, block):.8g}".replace("nan", "") for name in names)
+    return Path(target)
+
+
+def _pooled(name: str, block: Mapping[str, Array]) -> float:
+    """One value for the rows of ``block``."""
+    values = block[name]
+    if name in _LAST:
+        return float(values[-1])
+    if name == "serves":
+        return float(values.sum())
+    weight = block["serves"] if name in _SHARES and "serves" in block else np.ones(len(values))
+    weight = np.where(np.isnan(values), 0.0, weight)
+    return float(np.nansum(values * weight) / weight.sum()) if weight.sum() > 0 else float("nan")
