@@ -115,13 +115,13 @@ def test_outputs_stay_the_same_tensors(model, path):
 
 def test_masked_worlds_are_updated_alone(model, path):
     kinematics = Kinematics(model, WORLDS, SUBSTEPS, "cpu")
-    tensors = [torch.tensor(p, dtype=torch.float32) for p in path]
-    kinematics.update(*tensors)
+    positions, velocities = (torch.tensor(p, dtype=torch.float32) for p in path)
+    kinematics.update(positions, velocities)
     outputs = (kinematics.paddle_path, kinematics.foot_position, kinematics.head_position)
     before = [output.clone() for output in outputs]
-    tensors[0][:, :, 0] += 1.0
+    positions[:, :, 0] += 1.0
     mask = torch.tensor([False, True] * (WORLDS // 2))
-    kinematics.update(*tensors, mask)
+    kinematics.update(positions, velocities, mask)
     for old, new in zip(
         before, (kinematics.paddle_path, kinematics.foot_position, kinematics.head_position), strict=True
     ):
