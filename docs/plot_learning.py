@@ -1,4 +1,4 @@
-"""Plot the learning curves of ``docs/learning``: python docs/plot_learning.py
+"""Plot the learning curves of ``docs/learning``: python -m docs.plot_learning
 
 Reads ``seed*.csv`` (metrics of the default configuration, see docs/learning.md) and ``prototype.csv`` (the throw-away
 prototype that the recipe started from); writes ``docs/figures/learning.png`` and prints the table of milestones.

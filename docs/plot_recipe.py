@@ -1,4 +1,4 @@
-"""The table and the figure of ``docs/recipe.md``: python docs/plot_recipe.py [FOLDER_OF_RUNS]
+"""The table and the figure of ``docs/recipe.md``: python -m docs.plot_recipe [FOLDER_OF_RUNS]
 
 ``docs/recipe/runs.csv`` lists the runs, and ``docs/recipe/<experiment>_seed<seed>.csv`` are their metrics. With a
 folder of run folders, the metrics of those runs that it holds are taken from there first. Prints the table as Markdown
