@@ -89,8 +89,10 @@ def test_the_network_is_finite_on_what_is_no_flight(scale: float) -> None:
 
 def test_untrained_it_predicts_the_apex_that_was_fitted() -> None:
     network = PredictorNetwork(load_train_config(["predictor=filter"]).predictor)
-    torch.nn.init.zeros_(network.layers[-1].weight)
-    torch.nn.init.zeros_(network.layers[-1].bias)
+    last = network.layers[-1]
+    assert isinstance(last, torch.nn.Linear)
+    torch.nn.init.zeros_(last.weight)
+    torch.nn.init.zeros_(last.bias)
     window, bounce, apex = flights(20, 33)
     predicted = network(window.flatten(1))
     assert (predicted[:, :3] - apex).norm(dim=1).max().item() < 0.005
