@@ -226,8 +226,12 @@ def test_the_page_in_a_browser(page: tuple, port: int, tmp_path: Path) -> None:
         wait_for(lambda: not np.allclose(shown.show.advance(0.0).qpos, before, atol=1e-3), "the robot to move")
         wait_for(lambda: browser.screenshot() != first, "the picture to change")
         flights = shown.show.flights
-        browser.click("Next serve")
-        wait_for(lambda: "last: skipped" in browser.text, "the next serve")
+
+        def serve_is_skipped() -> bool:  # again and again: a slow page may not show it before that serve is over too
+            browser.click("Next serve")
+            return "last: skipped" in browser.text
+
+        wait_for(serve_is_skipped, "the next serve")
         assert shown.show.flights > flights
         browser.click("venue")
         wait_for(lambda: "ball venue" in browser.text, "the other ball")
