@@ -1,7 +1,8 @@
-"""Plot the learning curves of ``docs/learning``: python -m docs.plot_learning
+"""Plot the learning curves of docs/learning.md: python -m docs.plot_learning
 
-Reads ``seed*.csv`` (metrics of the default configuration, see docs/learning.md) and ``prototype.csv`` (the throw-away
-prototype that the recipe started from); writes ``docs/figures/learning.png`` and prints the table of milestones.
+Reads ``recipe/return_velocity_seed*.csv`` (metrics of the default configuration, which ``docs.plot_recipe`` takes over)
+and ``learning/prototype.csv`` (the throw-away prototype that the recipe came from); writes
+``docs/figures/learning.png`` and prints the table of milestones.
 """
 
 from __future__ import annotations
@@ -50,7 +51,8 @@ def plot(curves: dict[str, Curve], path: Path) -> None:
 
 def main() -> None:
     """Read, print, plot."""
-    curves = {path.stem: read_curve(path) for path in sorted((HERE / "learning").glob("seed*.csv"))}
+    seeds = sorted((HERE / "recipe").glob("return_velocity_seed*.csv"))
+    curves = {path.stem.removeprefix("return_velocity_"): read_curve(path) for path in seeds}
     curves["prototype"] = read_curve(HERE / "learning" / "prototype.csv", columns=PROTOTYPE)
     print_table(curves)
     target = HERE / "figures" / "learning.png"
