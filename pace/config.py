@@ -239,6 +239,23 @@ class SensingConfig:
 
 
 @dataclass
+class ReturnMemoryConfig:
+    """What the robot remembers of its own returns (:class:`pace.rl.memory.ReturnMemory`)."""
+
+    prior: float  # restitution before the first hit
+    prior_hits: float  # hits that the prior is worth
+    hits: float  # older hits fade once there are that many
+    reach: float  # m; a ball further from the paddle when it is seen to turn was turned by something else
+    closing_speed: float  # m/s along the normal; a slower hit tells nothing
+    largest: float  # largest single estimate
+
+    def __post_init__(self) -> None:
+        for name in ("prior_hits", "reach", "closing_speed", "largest"):
+            _require(getattr(self, name) > 0, f"observation.return_memory.{name} must be positive")
+        _require(self.hits >= 1, "observation.return_memory.hits must be at least 1")
+
+
+@dataclass
 class ObservationConfig:
     """Names of the observations of each network, in order, and how many control steps of history each sees."""
 
@@ -247,6 +264,7 @@ class ObservationConfig:
     critic: list[str]
     policy_history: int
     critic_history: int
+    return_memory: ReturnMemoryConfig | None = None  # needed by the observation last_return
 
     def __post_init__(self) -> None:
         _require(self.policy_history >= 1, "observation.policy_history must be at least 1")

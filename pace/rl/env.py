@@ -75,7 +75,7 @@ class TableTennisEnv(EnvBase):
     ) -> None:
         if num_worlds < 1:
             raise ConfigError(f"num_worlds must be at least 1, got {num_worlds}")
-        check_policy(config.observation.policy, config.predictor)
+        check_policy(config.observation, config.predictor)
         check_critic(config.observation.critic)
         worlds = worlds or Worlds(config, num_worlds, device)
         super().__init__(device=worlds.device, batch_size=(num_worlds,))
@@ -103,9 +103,9 @@ class TableTennisEnv(EnvBase):
             config.sensing, self.num_worlds, device, worlds.control_dt, worlds.nominal, self.generator
         )
         rule, rules, action = reward.nothing_to_hit, self.game.rules, self.task_state.action
-        self.actor = ActorSignals(
-            self.sensing, worlds.kinematics, worlds.nominal, action, predictor, config.predictor, rule, rules
-        )
+        signals = (self.sensing, worlds.kinematics, worlds.nominal, action)
+        memory = config.observation.return_memory
+        self.actor = ActorSignals(*signals, predictor, config.predictor, rule, rules, memory)
         self.statistics = Statistics(self.num_worlds, device)
 
     def _allocate(self) -> None:
@@ -173,6 +173,8 @@ class TableTennisEnv(EnvBase):
         self.sensing.update(self.worlds.robot, self.worlds.ball.position, next_serve)
         self.actor.track.update(self.sensing.ball_position, next_serve)
         self._compute_signals()
+        if self.actor.memory is not None:
+            self.actor.memory.update()
         self._policy_history.push(self._policy_signals())
         self._critic_history.push(self._critic_signals())
         self._flag_bad()
@@ -198,6 +200,8 @@ class TableTennisEnv(EnvBase):
         self.sensing.reset(mask, self.worlds.robot, self.worlds.ball.position)
         self.actor.track.restart(mask, self.sensing.ball_position)
         self._compute_signals(mask)
+        if self.actor.memory is not None:
+            self.actor.memory.restart(mask)
         self._policy_history.fill(mask, self._policy_signals())
         self._critic_history.fill(mask, self._critic_signals())
 
@@ -271,7 +275,8 @@ class TableTennisEnv(EnvBase):
         return sums | {f"reward/{name}": value for name, value in terms.items()}
 
     def _parts(self) -> dict[str, object]:
-        return {
+        memory = {} if self.actor.memory is None else {"memory": self.actor.memory}
+        return memory | {
             "state": self.task_state,
             "sensing": self.sensing,
             "track": self.actor.track,

@@ -17,8 +17,9 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from pace.config import ConfigError, PredictorConfig
+from pace.config import ConfigError, ObservationConfig, PredictorConfig, ReturnMemoryConfig
 from pace.predictor.network import OUTPUT_SIZES, predictor_slices
+from pace.rl.memory import SEEN, ReturnMemory
 from pace.rl.signal_kernels import PredictionLayout, fill_frames, follow_ball, read_prediction
 from pace.rl.state import TaskState
 from pace.rl.task_kernels import Rules
@@ -91,7 +92,8 @@ class ActorSignals:
 
     Attributes, besides ``sensing`` and ``track``: ``action`` (N, J) the previous action, ``apex``, ``target``
     (N, 3) m predicted, ``time`` (N,) s until the ball is at the target, ``shift`` (N, 2) m from the sensed base to
-    where it should stand, ``paddle_position`` (N, 3) m, ``paddle_normal`` (N, 3), ``prediction`` (N, P) raw output.
+    where it should stand, ``paddle_position`` (N, 3) m, ``paddle_normal`` (N, 3), ``prediction`` (N, P) raw output;
+    ``memory`` of its returns, which its owner updates.
 
     Args:
         sensing: the robot's sensors.
@@ -102,6 +104,7 @@ class ActorSignals:
         config: which outputs the predictor has, and whether it is used.
         rule: numbers of ``reward.nothing_to_hit``.
         rules: where to stand, in the kernels' form.
+        memory: numbers of the memory of returns, or ``None`` without one.
     """
 
     def __init__(
@@ -114,6 +117,7 @@ class ActorSignals:
         config: PredictorConfig,
         rule: Mapping[str, float],
         rules: Rules,
+        memory: ReturnMemoryConfig | None = None,
     ) -> None:
         num_worlds, device = action.shape[0], action.device
         self.sensing, self.action = sensing, action
@@ -128,6 +132,7 @@ class ActorSignals:
         self.paddle_position = torch.zeros(num_worlds, 3, device=device)
         self.paddle_normal = torch.zeros(num_worlds, 3, device=device)
         self._read = self._record(predictor_slices(config.outputs), rules)
+        self.memory = self._remember(memory, rules.control_dt) if memory else None
 
     def _record(self, slices: dict[str, slice], rules: Rules) -> Callable[[], None]:
         columns = PredictionLayout()
@@ -140,6 +145,10 @@ class ActorSignals:
         results = [share(self.apex), share(self.target), share(self.time), shift]
         inputs = [wp.from_torch(self.prediction), columns, *seen, rules, *results]
         return record(read_prediction, self.action.shape[0], inputs, self.action.device)
+
+    def _remember(self, config: ReturnMemoryConfig, control_dt: float) -> ReturnMemory:
+        track = self.track
+        return ReturnMemory(config, control_dt, track.positions, track.turned, self.paddle_position, self.paddle_normal)
 
     def compute(self, changed: Tensor | None = None) -> None:
         """Everything that follows from the current ``sensing``, ``track`` and ``action``.
@@ -178,6 +187,11 @@ class CriticObservation(NamedTuple):
     function: Callable[[TaskState], Tensor]
 
 
+def _last_return(signals: ActorSignals) -> Tensor:
+    assert signals.memory is not None  # check_policy has seen to it
+    return signals.memory.seen
+
+
 def _column(values: Tensor) -> Tensor:
     return values.unsqueeze(-1).float()
 
@@ -198,6 +212,7 @@ POLICY: dict[str, ActorObservation] = {
     "sensed_paddle_normal": ActorObservation(3, lambda s: s.paddle_normal),
     "predicted_time": ActorObservation(1, lambda s: _column(s.time)),
     "something_to_hit": ActorObservation(1, lambda s: _column(s.track.something_to_hit)),
+    "last_return": ActorObservation(SEEN, _last_return),
 }
 
 #: What the critic can see: the truth.
@@ -224,14 +239,25 @@ CRITIC: dict[str, CriticObservation] = {
     "paddle_to_target": CriticObservation(3, lambda s: s.target - s.robot.paddle_position),
     "paddle_velocity": CriticObservation(3, lambda s: s.robot.paddle_velocity),
     "paddle_normal": CriticObservation(3, lambda s: s.robot.paddle_normal),
+    # of each world: the restitution is that at speed zero
+    "paddle_restitution": CriticObservation(1, lambda s: _column(torch.as_tensor(s.ball.params.paddle_restitution))),
+    "paddle_friction": CriticObservation(1, lambda s: _column(torch.as_tensor(s.ball.params.paddle_friction))),
 }
 
 Table = Mapping[str, ActorObservation] | Mapping[str, CriticObservation]
 
 
-def check_policy(names: list[str], predictor: PredictorConfig) -> None:
+def check_policy(observation: ObservationConfig, predictor: PredictorConfig) -> None:
     """Raise :class:`ConfigError` for a name that the actor may not see, or that nobody computes."""
+    names = observation.policy
     _check_names("policy", names, POLICY)
+    if "last_return" in names:
+        if observation.return_memory is None:
+            raise ConfigError(
+                "observation.policy has 'last_return': give observation.return_memory (observation=memory)"
+            )
+        if predictor.frames < 5:
+            raise ConfigError(f"observation 'last_return' needs predictor.frames of 5 or more, got {predictor.frames}")
     if "predicted_time" in names and predictor.enabled and "target_time" not in predictor.outputs:
         raise ConfigError("observation.policy has 'predicted_time': add 'target_time' to predictor.outputs")
 

@@ -100,3 +100,82 @@ def fill_frames(mask: wp.array[wp.bool], frame: wp.array2d[wp.float32], observat
     size = frame.shape[1]
     for i in range(row.shape[0]):
         row[i] = frame[world, i % size]
+
+
+@wp.struct
+class MemoryRules:
+    """Numbers of :class:`pace.rl.memory.ReturnMemory`; m, s."""
+
+    control_dt: float
+    gravity: float
+    prior: float
+    prior_hits: float
+    hits: float
+    reach: float
+    closing_speed: float
+    largest: float
+
+
+#: Columns of a world's memory: steps since the ball was seen to turn (0: it has not), the paddle's position one and two
+#: steps ago and its normal one step ago; of the hit: ball's velocity before it, paddle's velocity and normal; seen:
+#: velocity of the last return, estimated restitution above the prior, share of hits.
+AGE, POSITION_1, POSITION_2, NORMAL_1 = wp.constant(0), wp.constant(1), wp.constant(4), wp.constant(7)
+BEFORE, PADDLE, NORMAL = wp.constant(10), wp.constant(13), wp.constant(16)
+RETURN, RESTITUTION, SHARE = wp.constant(19), wp.constant(22), wp.constant(23)
+MEMORY_SIZE = 24
+
+
+@wp.func
+def _keep(row: wp.array[wp.float32], start: int, value: wp.vec3):
+    for i in range(3):
+        row[start + i] = value[i]
+
+
+@wp.func
+def _learn(row: wp.array[wp.float32], after: wp.vec3, rules: MemoryRules):
+    """One more estimate of the restitution, from the velocities at the hit."""
+    normal = _position(row, NORMAL)
+    paddle = _position(row, PADDLE)
+    closing = wp.dot(_position(row, BEFORE) - paddle, normal)
+    if wp.abs(closing) < rules.closing_speed:
+        return
+    estimate = wp.clamp(-wp.dot(after - paddle, normal) / closing, 0.0, rules.largest)
+    hits = wp.min(row[SHARE] * rules.hits, rules.hits - 1.0)  # older ones fade once there are that many
+    weight = hits + rules.prior_hits
+    row[RESTITUTION] = (row[RESTITUTION] * weight + estimate - rules.prior) / (weight + 1.0)
+    row[SHARE] = (hits + 1.0) / rules.hits
+
+
+@wp.kernel
+def remember_return(
+    track: wp.array2d[wp.float32],
+    turned: wp.array[wp.bool],
+    paddle_position: wp.array[wp.vec3],
+    paddle_normal: wp.array[wp.vec3],
+    rules: MemoryRules,
+    memory: wp.array2d[wp.float32],
+):
+    """One control step of a world's memory; ``track`` holds the ball's last positions, oldest first."""
+    world = wp.tid()
+    row, ball = memory[world], track[world]
+    newest = ball.shape[0] - 3
+    paddle = paddle_position[world]
+    age = 0.0
+    if turned[world]:
+        age = wp.min(row[AGE] + 1.0, 4.0)
+    fall = wp.vec3(0.0, 0.0, 2.0 * rules.control_dt * rules.gravity)  # in the two steps to the hit, and from it
+    span = 2.0 * rules.control_dt
+    if age == 1.0:
+        _keep(row, BEFORE, (_position(ball, newest - 6) - _position(ball, newest - 12)) / span - fall)
+        _keep(row, PADDLE, (paddle - _position(row, POSITION_2)) / span)
+        _keep(row, NORMAL, _position(row, NORMAL_1))
+        if wp.length(_position(ball, newest) - paddle) > rules.reach:
+            age = 4.0  # not the paddle turned it
+    if age == 3.0:
+        after = (_position(ball, newest) - _position(ball, newest - 6)) / span
+        _keep(row, RETURN, after)
+        _learn(row, after + fall, rules)
+    row[AGE] = age
+    _keep(row, POSITION_2, _position(row, POSITION_1))
+    _keep(row, POSITION_1, paddle)
+    _keep(row, NORMAL_1, paddle_normal[world])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import pytest
@@ -33,7 +33,8 @@ IDLE = torch.tensor([-1.7, -0.3, 1.0])
 
 
 @pytest.mark.parametrize(
-    ("overrides", "policy", "critic"), [(("observation=paper",), 82, 93), (("observation=pace",), 90, 107)]
+    ("overrides", "policy", "critic"),
+    [(("observation=paper",), 82, 93), (("observation=pace",), 90, 107), (("observation=memory",), 95, 109)],
 )
 def test_sizes(overrides: tuple[str, ...], policy: int, critic: int) -> None:
     names = config(*overrides).observation
@@ -49,14 +50,14 @@ def test_layout_follows_the_order_of_the_names() -> None:
 @pytest.mark.parametrize("name", ["ball_velocity", "apex", "paddle_touched", "base_linear_velocity"])
 def test_privileged_names_are_refused_for_the_actor(name: str) -> None:
     with pytest.raises(ConfigError, match=f"unknown name '{name}' .privileged"):
-        check_policy(["heading", name], config().predictor)
+        check_policy(replace(config().observation, policy=["heading", name]), config().predictor)
 
 
 def test_unknown_names_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"observation.critic: unknown name 'ball_colour'"):
         check_critic(["ball_colour"])
     with pytest.raises(ConfigError, match=r"add 'target_time' to predictor.outputs"):
-        check_policy(["predicted_time"], config("predictor=paper").predictor)
+        check_policy(config("observation=pace").observation, config("predictor=paper").predictor)
     with pytest.raises(ConfigError, match=r"predictor.outputs"):
         predictor_slices(["apex", "spin"])
     with pytest.raises(ConfigError, match=r"predictor.outputs"):

@@ -1,0 +1,145 @@
+"""What the robot remembers of its returns: the estimate of the restitution against hits that are made up exactly."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from pace.config import ConfigError, ReturnMemoryConfig
+from pace.rl.env import make_env
+from pace.rl.memory import GRAVITY, SEEN, ReturnMemory
+from pace.rl.observations import check_policy
+from tests.rl.fakes import config
+
+DT = 0.02
+PRIOR, PRIOR_HITS = 0.65, 0.5
+CONFIG = ReturnMemoryConfig(PRIOR, PRIOR_HITS, hits=4.0, reach=0.5, closing_speed=2.0, largest=1.2)
+BALL, PADDLE = torch.tensor([-5.0, 0.3, -0.5]), torch.tensor([1.5, -0.2, 0.4])  # m/s before the hit
+NORMAL = torch.nn.functional.normalize(torch.tensor([0.9, 0.2, 0.3]), dim=0)
+POINT = torch.tensor([-1.6, -0.2, 1.0])  # m, where they meet
+
+
+class Rally:
+    """One world's memory, and made-up hits to feed it with."""
+
+    def __init__(self) -> None:
+        self.track, self.turned = torch.zeros(1, 15), torch.zeros(1, dtype=torch.bool)
+        self.paddle, self.normal = torch.zeros(1, 3), NORMAL.repeat(1, 1)
+        self.memory = ReturnMemory(CONFIG, DT, self.track, self.turned, self.paddle, self.normal)
+
+    def hit(self, restitution: float, paddle: Tensor = PADDLE, away: Tensor | None = None) -> Tensor:
+        """Play a ball that is hit one step before it is seen to turn; its velocity just after the hit."""
+        closing = torch.dot(BALL - paddle, NORMAL)
+        after = BALL - (1.0 + restitution) * closing * NORMAL
+        gravity = torch.tensor([0.0, 0.0, -GRAVITY])
+        path = []
+        for step in range(-5, 6):  # 0 is the hit
+            time = step * DT
+            velocity = BALL if step <= 0 else after
+            path.append(POINT + velocity * time + 0.5 * gravity * time**2)
+        for newest in range(4, len(path)):
+            self.track.copy_(torch.stack(path[newest - 4 : newest + 1]).view(1, 15))
+            time = (newest - 5) * DT
+            self.paddle.copy_(POINT + paddle * time if away is None else away)
+            self.turned.fill_(newest >= 6)  # one step after the hit
+            self.memory.update()
+        return after
+
+    def next_ball(self) -> None:
+        self.track.copy_(torch.tensor([1.35, 0.0, 1.03]).repeat(1, 5))
+        self.turned.fill_(False)
+        self.memory.update()
+
+    @property
+    def estimate(self) -> float:
+        return float(self.memory.seen[0, 3]) + PRIOR
+
+
+@pytest.mark.parametrize("restitution", [0.38, 0.65, 0.87])
+def test_one_hit_moves_the_prior_by_its_weight(restitution: float) -> None:
+    rally = Rally()
+    assert rally.memory.seen.abs().max() == 0.0
+    after = rally.hit(restitution)
+    assert rally.estimate == pytest.approx((PRIOR * PRIOR_HITS + restitution) / (PRIOR_HITS + 1.0), abs=1e-3)
+    # seen in the middle of the two steps that begin one step after the hit
+    expected = after - torch.tensor([0.0, 0.0, 2.0 * DT * GRAVITY])
+    assert torch.allclose(rally.memory.seen[0, :3], expected, atol=2e-3)
+    assert float(rally.memory.seen[0, 4]) == pytest.approx(1.0 / CONFIG.hits)
+
+
+def test_many_hits_come_to_the_truth_and_old_ones_fade() -> None:
+    rally = Rally()
+    for restitution, rounds in ((0.45, 12), (0.8, 12)):
+        for _ in range(rounds):
+            rally.next_ball()
+            rally.hit(restitution)
+        assert rally.estimate == pytest.approx(restitution, abs=0.03)
+    assert float(rally.memory.seen[0, 4]) == pytest.approx(1.0)
+
+
+def test_what_is_no_hit_of_the_paddle_teaches_nothing() -> None:
+    rally = Rally()
+    rally.hit(0.8, away=POINT - torch.tensor([0.6, 0.0, 0.0]))  # turned by the net, say
+    assert rally.memory.seen.abs().max() == 0.0
+    rally.next_ball()
+    moving_with_it = BALL + torch.tensor([1.0, 0.0, 0.0])
+    rally.hit(0.8, paddle=moving_with_it)  # too slow to tell a restitution; where the ball went is seen
+    assert float(rally.memory.seen[0, 3]) == 0.0
+    assert rally.memory.seen[0, :3].abs().max() > 1.0
+
+
+def test_a_new_ball_before_the_return_was_seen_leaves_the_memory_as_it_was() -> None:
+    rally = Rally()
+    rally.hit(0.8)
+    before = rally.memory.seen.clone()
+    rally.next_ball()
+    rally.turned.fill_(True)
+    rally.memory.update()
+    rally.next_ball()
+    rally.next_ball()
+    assert torch.equal(rally.memory.seen, before)
+
+
+def test_it_can_be_forgotten_world_by_world() -> None:
+    rally = Rally()
+    rally.hit(0.8)
+    rally.memory.restart(torch.tensor([False]))
+    assert rally.memory.state.abs().max() > 0.0
+    rally.memory.restart(torch.tensor([True]))
+    assert rally.memory.state.abs().max() == 0.0
+
+
+def test_the_actor_remembers_over_serves_and_forgets_with_the_episode() -> None:
+    env = make_env(2, "native", "cpu", overrides=["observation=memory", "engine.threads=1"])
+    assert env.actor.memory is not None
+    env.actor.memory.state[:, -SEEN:] = 0.25
+    columns = env.policy_layout["last_return"]
+    for _ in range(5):
+        env.advance(torch.zeros(2, 21))
+    frame = env.policy_observation.view(2, 5, -1)[:, -1, columns]
+    assert torch.equal(frame, torch.full((2, SEEN), 0.25))
+    saved = env.state_dict()
+    env.reset_worlds(torch.tensor([True, False]))
+    assert env.policy_observation.view(2, 5, -1)[:, -1, columns].tolist() == [[0.0] * SEEN, [0.25] * SEEN]
+    env.load_state_dict(saved)
+    assert torch.equal(env.actor.memory.seen, torch.full((2, SEEN), 0.25))
+
+
+def test_the_critic_sees_the_contact_that_the_ball_has() -> None:
+    env = make_env(64, "native", "cpu", overrides=["observation=memory", "randomization=wide", "engine.threads=1"])
+    seen = env.critic_observation[:, env.critic_layout["paddle_restitution"]].squeeze(1)
+    assert torch.equal(seen, torch.as_tensor(env.worlds.ball.params.paddle_restitution))
+    assert float(seen.std()) > 0.05
+
+
+def test_it_needs_its_numbers_and_five_frames() -> None:
+    task = config("observation=memory")
+    task.observation.return_memory = None
+    with pytest.raises(ConfigError, match="observation=memory"):
+        check_policy(task.observation, task.predictor)
+    task = config("observation=memory", "predictor.frames=4")
+    with pytest.raises(ConfigError, match=r"predictor.frames of 5 or more, got 4"):
+        check_policy(task.observation, task.predictor)
+    with pytest.raises(ConfigError, match=r"return_memory.reach must be positive"):
+        config("observation=memory", "observation.return_memory.reach=0.0")
