@@ -66,7 +66,7 @@ class RobotConfig:
     base_height: float  # m, base above the floor at reset
     joint_groups: list[JointGroup]  # the first match of a joint counts
     nominal_pose: dict[str, float]  # rad; joints not named stand at 0
-    stall_ratio: float = 0.0  # stall torque over effort; 0: full effort at any speed, as policies of before were trained
+    stall_ratio: float = 0.0  # stall torque over effort; 0: full effort at any speed, as before there was a limit
 
     def __post_init__(self) -> None:
         _require(self.control_dt > 0, "robot.control_dt must be positive")
