@@ -252,6 +252,24 @@ def disc_distance(offset: Vector, axis: Vector, radius: float, half_thickness: f
     return distance, (above * face + beyond * rim) / distance
 
 
+def build_model(scene: Path, meta: Mapping[str, Any]) -> mujoco.MjModel:
+    """The scene with the motors of the training: gains, effort and, where the file has it, the torque-speed line."""
+    spec = mujoco.MjSpec.from_file(str(scene))
+    speeds, stalls = (meta.get(key) or [None] * len(meta["joint_names"]) for key in ("max_speed", "stall_torque"))
+    motors = zip(meta["joint_names"], meta["kp"], meta["kd"], meta["effort"], speeds, stalls, strict=True)
+    for name, kp, kd, effort, speed, stall in motors:
+        actuator = spec.actuator(name)
+        if speed is None:
+            actuator.set_to_position(kp=kp, kv=kd)
+        else:  # in volts that are rad/s: torque = (V - w) stall / speed, V = w + speed / stall (kp (u - q) - kd w)
+            position = int(mujoco.mjtCtrlInput.mjINPUT_POS)
+            actuator.set_to_dcmotor(
+                motorconst=[1.0, 1.0], resistance=speed / stall, controller=[kp, 0, kd, 0, 0, speed], ctrlspec=position
+            )
+        actuator.forcerange = [-effort, effort]
+    return spec.compile()
+
+
 class Robot:
     """The robot in MuJoCo, with position controllers on its joints, and sensors that are noisy and late.
 
@@ -260,7 +278,7 @@ class Robot:
 
     def __init__(self, meta: Mapping[str, Any], scene: Path, noise: float, random: np.random.Generator) -> None:
         self.meta, self.noise, self._random = meta, noise, random
-        self.model = model = mujoco.MjModel.from_xml_path(str(scene))
+        self.model = model = build_model(scene, meta)
         self.data = mujoco.MjData(model)
         joints = [model.joint(name) for name in meta["joint_names"]]
         self._qpos = np.array([joint.qposadr[0] for joint in joints])
@@ -272,15 +290,10 @@ class Robot:
         self._targets: deque[Vector] = deque(maxlen=1)
 
     def _set_up(self, engine: Mapping[str, Any]) -> None:
-        """Gains, limits and solver of the training."""
+        """Solver and armature of the training."""
         model, meta = self.model, self.meta
         model.opt.timestep = PHYSICS_DT
         model.opt.iterations, model.opt.ls_iterations = engine["solver_iterations"], engine["line_search_iterations"]
-        kp, kd, effort = (np.array(meta[name]) for name in ("kp", "kd", "effort"))
-        model.actuator_gainprm[self._motors, 0] = kp
-        model.actuator_biasprm[self._motors, 1] = -kp
-        model.actuator_biasprm[self._motors, 2] = -kd
-        model.actuator_forcerange[self._motors] = np.stack([-effort, effort], axis=1)
         model.dof_armature[self._qvel] = meta["armature"]
 
     def _draw_steps(self, delay: list[float]) -> int:

@@ -51,6 +51,7 @@ class JointGroup:
     kp: float  # N m / rad
     kd: float  # N m s / rad
     effort: float  # N m
+    max_speed: float = 0.0  # rad/s, at which the motor gives no torque; needed where robot.stall_ratio is on
 
 
 @dataclass
@@ -65,9 +66,13 @@ class RobotConfig:
     base_height: float  # m, base above the floor at reset
     joint_groups: list[JointGroup]  # the first match of a joint counts
     nominal_pose: dict[str, float]  # rad; joints not named stand at 0
+    stall_ratio: float = 0.0  # stall torque over effort; 0: full effort at any speed, as before there was a limit
 
     def __post_init__(self) -> None:
         _require(self.control_dt > 0, "robot.control_dt must be positive")
+        _require(self.stall_ratio == 0 or self.stall_ratio >= 1, "robot.stall_ratio must be 0 (no limit) or at least 1")
+        slow = [group.match for group in self.joint_groups if group.max_speed <= 0]
+        _require(not (self.stall_ratio and slow), f"robot.stall_ratio needs the max_speed of the joint groups {slow}")
         _require(self.action_clip > 0, "robot.action_clip must be positive")
 
 
@@ -217,6 +222,7 @@ class RandomizationConfig:
         for f in fields(self):
             if f.name != "name":
                 _check_range(f"randomization.{f.name}", getattr(self, f.name))
+        _require(self.effort_scale[0] > 0, "randomization.effort_scale must be positive")
 
 
 @dataclass

@@ -36,7 +36,7 @@ from pace.rl.env import TableTennisEnv
 from pace.rl.loading import TaskPolicy, load_policy
 from pace.rl.observations import POLICY, layout
 from pace.rl.run_folder import VERSIONS, git_state, versions
-from pace.sim.robot import JOINT_NAMES, build_model, joint_gains, nominal_pose
+from pace.sim.robot import JOINT_NAMES, build_model, joint_gains, motor_lines, nominal_pose
 
 FORMAT = 1  # of the metadata
 ACTION_NOISE = 0.3  # standard deviation added to the actions while observations are recorded, so that they vary
@@ -158,6 +158,8 @@ def metadata(policy: TaskPolicy, differences: Mapping[str, float], options: Expo
     """All that the robot's own code needs to know, ready for JSON."""
     config = policy.config
     kp, kd, effort = joint_gains(config.robot).tolist()
+    lines = motor_lines(config.robot)
+    max_speed, stall_torque = (None, None) if lines is None else lines.tolist()
     model = build_model(config.robot, config.engine, config.ball.table)
     shapes = input_shapes(config)
     outputs = zip(OUTPUT_NAMES, OUTPUTS.values(), strict=True)
@@ -171,6 +173,8 @@ def metadata(policy: TaskPolicy, differences: Mapping[str, float], options: Expo
         "kp": kp,
         "kd": kd,
         "effort": effort,
+        "max_speed": max_speed,  # rad/s: the drive falls from the stall torque (N m) at rest to zero there; null: none
+        "stall_torque": stall_torque,
         "armature": config.robot.armature,
         "action_scale": config.robot.action_scale,
         "action_clip": config.robot.action_clip,

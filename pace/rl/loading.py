@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from pace.rl.env import TableTennisEnv
 
 #: Groups of configs/ that may be chosen anew for a saved policy; networks and observations may not.
-TASK_GROUPS = ("ball", "serve", "reset", "randomization", "sensing", "reward")
+TASK_GROUPS = ("ball", "serve", "reset", "randomization", "sensing", "reward", "robot")
 #: Parts of a saved task of which single values may be changed.
-CHANGEABLE = (*TASK_GROUPS, "engine", "robot")
+CHANGEABLE = (*TASK_GROUPS, "engine")
 RANDOM_STD = 0.8  # of the random policy's actions: how widely a training run begins to explore
 
 

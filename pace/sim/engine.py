@@ -27,7 +27,7 @@ class EngineParams:
     kp_scale: Tensor  # (N,) of all joints
     kd_scale: Tensor  # (N,)
     armature_scale: Tensor  # (N,)
-    effort_scale: Tensor  # (N,)
+    effort_scale: Tensor  # (N,) of the effort and, where the motors know their speed, of the stall torque
 
     @classmethod
     def nominal(cls, model: mujoco.MjModel, num_worlds: int, device: torch.device) -> EngineParams:
@@ -70,8 +70,11 @@ class ModelFields:
         self._subtree_mass = {body: float(model.body_subtreemass[body]) for body in (0, self._trunk)}
         self._inertia = constant(model.body_inertia[self._trunk])
         self._com = constant(model.body_ipos[self._trunk])
-        self._kp = constant(model.actuator_gainprm[:, 0])
-        self._kd = constant(-model.actuator_biasprm[:, 2])
+        # what set_to_dcmotor and set_to_position of pace.sim.robot write
+        self._with_speed = bool((model.actuator_gaintype == mujoco.mjtGain.mjGAIN_DCMOTOR).all())
+        self._resistance = constant(model.actuator_gainprm[:, 0])
+        self._kp = constant(model.actuator_gainprm[:, 4 if self._with_speed else 0])
+        self._kd = constant(model.actuator_gainprm[:, 6] if self._with_speed else -model.actuator_biasprm[:, 2])
         self._effort = constant(model.actuator_forcerange)
         self._armature = constant(model.dof_armature[6:])
 
@@ -79,18 +82,30 @@ class ModelFields:
         """What the model fields of the M worlds of ``params`` must hold."""
         trunk, everything, mass = self._trunk, slice(None), params.trunk_mass
         growth = (1.0 + mass / self._mass).unsqueeze(-1)
-        kp, kd = params.kp_scale.unsqueeze(-1) * self._kp, params.kd_scale.unsqueeze(-1) * self._kd
         return [
             ("pair_friction", (everything, slice(2)), params.friction.view(-1, 1, 1)),  # both directions
             ("body_mass", (trunk,), mass + self._mass),
             *(("body_subtreemass", (body,), mass + nominal) for body, nominal in self._subtree_mass.items()),
             ("body_inertia", (trunk,), growth * self._inertia),
             ("body_ipos", (trunk,), params.trunk_com + self._com),
-            ("actuator_gainprm", (everything, 0), kp),
-            ("actuator_biasprm", (everything, 1), -kp),
-            ("actuator_biasprm", (everything, 2), -kd),
+            *self._motors(params),
             ("actuator_forcerange", (everything,), params.effort_scale.view(-1, 1, 1) * self._effort),
             ("dof_armature", (slice(6, None),), params.armature_scale.unsqueeze(-1) * self._armature),
+        ]
+
+    def _motors(self, params: EngineParams) -> list[FieldWrite]:
+        every = slice(None)
+        kp, kd = params.kp_scale.unsqueeze(-1) * self._kp, params.kd_scale.unsqueeze(-1) * self._kd
+        if not self._with_speed:
+            return [
+                ("actuator_gainprm", (every, 0), kp),
+                ("actuator_biasprm", (every, 1), -kp),
+                ("actuator_biasprm", (every, 2), -kd),
+            ]
+        return [
+            ("actuator_gainprm", (every, 0), self._resistance / params.effort_scale.unsqueeze(-1)),
+            ("actuator_gainprm", (every, 4), kp),
+            ("actuator_gainprm", (every, 6), kd),
         ]
 
 

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from pace.config import ConfigError, EngineConfig, RobotConfig, TableConfig
+from pace.config import ConfigError, EngineConfig, JointGroup, RobotConfig, TableConfig
 
 SCENE = Path(__file__).parent / "assets" / "scene.xml"
 
@@ -56,6 +56,8 @@ TRUNK_BODY = "Trunk"
 NOMINAL_KEY = "nominal"
 #: Group of the geoms that only the eye needs.
 VISUAL_GROUP = 2
+#: The one input of a motor: its target position.
+POSITION = int(mujoco.mjtCtrlInput.mjINPUT_POS)
 
 
 def nominal_pose(robot: RobotConfig) -> NDArray[np.float64]:
@@ -74,13 +76,27 @@ def joint_gains(robot: RobotConfig) -> NDArray[np.float64]:
 
     Errors: :class:`ConfigError` for a joint that no group of ``robot.joint_groups`` matches.
     """
-    columns = []
-    for name in JOINT_NAMES:
-        group = next((g for g in robot.joint_groups if any(part in name for part in g.match)), None)
-        if group is None:
-            raise ConfigError(f"robot.joint_groups: no group matches joint {name}")
-        columns.append((group.kp, group.kd, group.effort))
-    return np.array(columns).T
+    groups = [_group(robot, name) for name in JOINT_NAMES]
+    return np.array([(group.kp, group.kd, group.effort) for group in groups]).T
+
+
+def motor_lines(robot: RobotConfig) -> NDArray[np.float64] | None:
+    """Rows no-load speed (rad/s) and stall torque (N m) of every joint: (2, 21); None: motors that know no speed.
+
+    The most that a motor drives with falls on a line from its stall torque at rest to zero at its no-load speed.
+    Errors: those of :func:`joint_gains`.
+    """
+    if not robot.stall_ratio:
+        return None
+    stall = robot.stall_ratio * joint_gains(robot)[2]
+    return np.array([[_group(robot, name).max_speed for name in JOINT_NAMES], stall])
+
+
+def _group(robot: RobotConfig, name: str) -> JointGroup:
+    group = next((g for g in robot.joint_groups if any(part in name for part in g.match)), None)
+    if group is None:
+        raise ConfigError(f"robot.joint_groups: no group matches joint {name}")
+    return group
 
 
 def build_model(robot: RobotConfig, engine: EngineConfig, table: TableConfig, visual: bool = False) -> mujoco.MjModel:
@@ -117,6 +133,20 @@ def _set_motors(spec: mujoco.MjSpec, robot: RobotConfig) -> None:
         actuator = spec.actuator(name)
         actuator.set_to_position(kp=kp, kv=kd)
         actuator.forcerange = [-effort, effort]
+        if robot.stall_ratio:
+            _set_line(actuator, kp, kd, _group(robot, name).max_speed, robot.stall_ratio * effort)
+
+
+def _set_line(actuator: mujoco.MjsActuator, kp: float, kd: float, speed: float, stall: float) -> None:
+    """Make the motor's drive saturate on its torque-speed line; below it the torque is kp (u - q) - kd w, as before.
+
+    MuJoCo's motor of constant K and resistance R gives K (V - K w) / R, and its drive asks for the voltage
+    V = R / K (kp (u - q) - kd w) + K w, at most Vmax. Volts are no measured quantity here, so K is 1: then Vmax is the
+    no-load speed and 1 / R the slope of the line. No winding inductance: the motor has no state.
+    """
+    actuator.set_to_dcmotor(
+        motorconst=[1.0, 1.0], resistance=speed / stall, controller=[kp, 0.0, kd, 0.0, 0.0, speed], ctrlspec=POSITION
+    )
 
 
 def _fit_table(spec: mujoco.MjSpec, table: TableConfig) -> None:

@@ -1,5 +1,5 @@
-"""``python -m pace.studies``: engines against each other, step sizes, solver settings, paddle reaction, and what a
-predictor can know (extra ``dev``).
+"""``python -m pace.studies``: engines against each other, step sizes, solver settings, paddle reaction, motors,
+and what a predictor can know (extra ``dev``).
 
 Prints the tables of ``docs/engines.md``, ``docs/physics.md`` and ``docs/predictor.md`` and writes their figures.
 """
@@ -13,7 +13,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
 
-from pace.studies import parity, predictor, reaction, steps
+from pace.studies import motors, parity, predictor, reaction, steps
 from pace.studies.swings import Swings, policy_swings, random_swings
 
 
@@ -57,6 +57,13 @@ def study_solver(options: argparse.Namespace) -> None:
     print(steps.table(steps.solver_cases(_swings(options).windows(steps.LENGTH))))
 
 
+def study_motors(options: argparse.Namespace) -> None:
+    cost = motors.cost()
+    print(", ".join(f"{case} the limit {1e6 * spent:.1f} us" for case, spent in cost.items()), "a step of a world")
+    runs = [options.run] if options.run else [Path("pretrained/pace"), Path("pretrained/wide")]
+    print(motors.table(motors.uses(runs, options.worlds, options.serves)))
+
+
 def study_predictor(options: argparse.Namespace) -> None:
     found = []
     for case in options.cases or predictor.CASES:
@@ -71,6 +78,7 @@ STUDIES = {
     "parity": study_parity,
     "steps": study_steps,
     "solver": study_solver,
+    "motors": study_motors,
     "predictor": study_predictor,
 }
 
@@ -81,7 +89,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("studies", nargs="*", choices=[*STUDIES, []], help="which; none: all")
     parser.add_argument("--worlds", type=int, default=16, help="worlds of each case")
     parser.add_argument("--run", type=Path, help="run folder or checkpoint whose swings to replay; none: random swings")
-    parser.add_argument("--serves", type=int, default=128, help="predictor: serves of each case")
+    parser.add_argument("--serves", type=int, default=128, help="motors, predictor: serves of each case")
     parser.add_argument("--cases", nargs="*", choices=list(predictor.CASES), help="predictor: which; none: all")
     beside = "predictor: runs or checkpoints to measure beside the bounds"
     parser.add_argument("--predictors", nargs="*", type=Path, default=[], help=beside)

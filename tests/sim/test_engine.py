@@ -199,12 +199,11 @@ def _trunk_com(model):
 
 
 def _kp(model):
-    model.actuator_gainprm[:, 0] *= 1.3
-    model.actuator_biasprm[:, 1] *= 1.3
+    model.actuator_gainprm[:, 4] *= 1.3
 
 
 def _kd(model):
-    model.actuator_biasprm[:, 2] *= 0.6
+    model.actuator_gainprm[:, 6] *= 0.6
 
 
 def _armature(model):
@@ -213,6 +212,7 @@ def _armature(model):
 
 def _effort(model):
     model.actuator_forcerange *= 0.2
+    model.actuator_gainprm[:, 0] /= 0.2  # the resistance: the stall torque too
 
 
 CHANGES = {

@@ -1,0 +1,141 @@
+"""The motors' torque-speed limit: what a policy asks of its motors without it and with it, and what a step costs."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import torch
+from mujoco.batch import Batch
+
+from pace.config import ConfigError, load_train_config
+from pace.rl.env import TableTennisEnv
+from pace.rl.evaluation import ServeRecorder, play, summarise
+from pace.rl.loading import TaskPolicy, load_policy
+from pace.sim.engine_native import stop_timers
+from pace.sim.robot import JOINT_NAMES, motor_lines
+from pace.studies.common import Array, markdown, model_of, study_config
+
+ROBOT = "robot=t1"  # the limit is of configs/, not of a policy that was trained before it
+WITHOUT, WITH = "without", "with"
+CASES = {WITHOUT: [ROBOT, "robot.stall_ratio=0"], WITH: [ROBOT]}
+#: Groups of motors, the first match counts.
+GROUPS = ("Right_Shoulder", "Right_Elbow", "Left_Shoulder", "Left_Elbow", "Waist", "Hip", "Knee", "Ankle")
+SLACK = 1e-3  # of the stall torque: float32
+SEED = 3
+COST_STEPS = 10
+
+
+class MotorRecorder(ServeRecorder):
+    """What becomes of the serves, and how the motors are used: counts of instants, by joint.
+
+    Attributes: ``instants``; ``fast`` (21,): speed over the motor's greatest; ``over`` (21,): torque over the line of
+    its world (in the last physics step of a control step, like ``joint_torque``); ``fastest`` (21,): largest speed, of
+    the motor's greatest.
+    """
+
+    def __init__(self, env: TableTennisEnv, warmup_serves: int, quota: int, lines: Array) -> None:
+        super().__init__(env, warmup_serves, quota)
+        self._speed, self._stall = torch.as_tensor(lines, dtype=torch.float32)
+        self.instants = 0
+        self.fast, self.over, self.fastest = (torch.zeros(len(JOINT_NAMES)) for _ in range(3))
+
+    def observe(self) -> None:
+        super().observe()
+        engine = self.env.worlds.engine
+        share = engine.qvel_path[:, -2, 6:] / self._speed
+        torque = engine.joint_torque * share.sign()
+        stall = engine.params.effort_scale.unsqueeze(-1) * self._stall
+        self.instants += self.env.num_worlds
+        self.fast += (share.abs() > 1.0).sum(0)
+        self.over += (torque > stall * (1.0 - share.abs()) + SLACK * stall).sum(0)
+        torch.maximum(self.fastest, share.abs().amax(0), out=self.fastest)
+
+
+@dataclass(frozen=True)
+class Use:
+    """Serves of a policy and use of its motors; arrays (21,): shares of time, and of the greatest speed."""
+
+    policy: str
+    case: str
+    hit: float
+    success: float
+    serves: int
+    fast: Array
+    over: Array
+    fastest: Array
+
+
+def use(policy: TaskPolicy, case: str, worlds: int, serves: int) -> Use:
+    """Play ``serves`` mixed serves of the saved task, counted after each world's first, 2 ms a physics step."""
+    task = ["reset=evaluation", "serve=mixed", "serve.serves_per_episode=0", "serve.end_after_hit=0"]
+    engine = ["engine=native", "engine.threads=1", "engine.physics_dt=0.002"]
+    env = policy.make_env(worlds, "cpu", SEED, [*task, *engine, *CASES[case]])
+    lines = motor_lines(load_train_config().robot)
+    if lines is None:
+        raise ConfigError("configs/robot/t1.yaml has no stall_ratio: there is no line to compare with")
+    recorder = MotorRecorder(env, 1, math.ceil(serves / worlds), lines)
+    play(env, policy, recorder)
+    table = env.config.ball.table
+    clear = table.height + table.net_height + env.config.ball.radius
+    row = summarise("mixed", recorder.records[:-1], (0.0, 0.0), clear)
+    shares = [(count / recorder.instants).double().numpy() for count in (recorder.fast, recorder.over)]
+    fastest = recorder.fastest.double().numpy()
+    return Use(policy.source, case, row["hit"], row["success"], row["serves"], shares[0], shares[1], fastest)
+
+
+def uses(runs: Sequence[Path], worlds: int, serves: int) -> list[Use]:
+    """Every policy without the limit and with it."""
+    found = []
+    for run in runs:
+        policy = load_policy(run)
+        for case in CASES:
+            found.append(use(policy, case, worlds, serves))
+            print(f"{Path(found[-1].policy).name}, {case}: done", flush=True)
+    return found
+
+
+def table(found: Sequence[Use]) -> str:
+    """One column a play: its serves, then for each group of motors time beyond speed and line, and the fastest."""
+    header = ["", *(f"{Path(use.policy).name}, {use.case}" for use in found)]
+    rows = [[f"hit, success (%) of {found[0].serves} serves"]]
+    rows[0] += [f"{100 * use.hit:.1f}, {100 * use.success:.1f}" for use in found]
+    for group in GROUPS:
+        columns = [i for i, name in enumerate(JOINT_NAMES) if group in name]
+        cells = [
+            f"{100 * use.fast[columns].mean():.2f}, {100 * use.over[columns].mean():.2f}, "
+            f"{use.fastest[columns].max():.2f}"
+            for use in found
+        ]
+        rows.append([group.replace("_", " ").lower(), *cells])
+    return markdown(header, rows)
+
+
+def cost(worlds: int = 256, repeats: int = 7) -> dict[str, float]:
+    """Processor time (s) of a physics step of one world, native, one thread: the least of ``repeats`` alternations.
+
+    Standing robots whose targets jump, so that some motors saturate.
+    """
+    stop_timers()
+    batches = {}
+    for case, ratio in ((WITHOUT, 0.0), (WITH, 2.0)):
+        config = study_config(physics_dt=0.002)
+        model = model_of(dataclasses.replace(config, robot=dataclasses.replace(config.robot, stall_ratio=ratio)))
+        batches[case] = (model, Batch(model, worlds, 1))
+    targets = np.random.default_rng(SEED).normal(0.0, 0.3, (worlds, 1, 21))
+    least = dict.fromkeys(batches, math.inf)
+    for _ in range(repeats):
+        for case, (model, batch) in batches.items():
+            control = np.repeat(model.key_qpos[0, 7:] + targets, COST_STEPS, axis=1)
+            batch.bind("qpos")[:], batch.bind("qvel")[:] = model.key_qpos[0], 0.0
+            batch.bind("qacc_warmstart")[:] = 0.0
+            started = time.process_time()
+            batch.rollout(COST_STEPS, control, int(mujoco.mjtState.mjSTATE_CTRL), ("qpos",))
+            least[case] = min(least[case], time.process_time() - started)
+    return {case: spent / (worlds * COST_STEPS) for case, spent in least.items()}
