@@ -1,7 +1,8 @@
 """``python -m pace.studies``: engines against each other, step sizes, solver settings, paddle reaction, motors,
-and what a predictor can know (extra ``dev``).
+what a predictor can know, and whether a policy finds out its paddle (extra ``dev``).
 
-Prints the tables of ``docs/engines.md``, ``docs/physics.md`` and ``docs/predictor.md`` and writes their figures.
+Prints the tables of ``docs/engines.md``, ``docs/physics.md``, ``docs/predictor.md`` and ``docs/campaign.md`` and writes
+their figures.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
 
-from pace.studies import motors, parity, predictor, reaction, steps
+from pace.studies import adaptation, motors, parity, predictor, reaction, steps
 from pace.studies.swings import Swings, policy_swings, random_swings
 
 
@@ -60,8 +61,18 @@ def study_solver(options: argparse.Namespace) -> None:
 def study_motors(options: argparse.Namespace) -> None:
     cost = motors.cost()
     print(", ".join(f"{case} the limit {1e6 * spent:.1f} us" for case, spent in cost.items()), "a step of a world")
-    runs = [options.run] if options.run else [Path("pretrained/pace"), Path("pretrained/wide")]
-    print(motors.table(motors.uses(runs, options.worlds, options.serves)))
+    print(motors.table(motors.uses(_policies(options), options.worlds, options.serves)))
+
+
+def study_adaptation(options: argparse.Namespace) -> None:
+    found = adaptation.adaptations(_policies(options), options.worlds)
+    print(adaptation.table(found))
+    _save(options.out, "adaptation", (11.5, 3.2), lambda figure: adaptation.draw(found, figure))
+
+
+def _policies(options: argparse.Namespace) -> list[Path]:
+    kept = sorted(path.parent for path in Path("pretrained").glob("*/checkpoint.json"))
+    return [options.run] if options.run else kept
 
 
 def study_predictor(options: argparse.Namespace) -> None:
@@ -80,6 +91,7 @@ STUDIES = {
     "solver": study_solver,
     "motors": study_motors,
     "predictor": study_predictor,
+    "adaptation": study_adaptation,
 }
 
 
@@ -88,7 +100,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m pace.studies", description=__doc__)
     parser.add_argument("studies", nargs="*", choices=[*STUDIES, []], help="which; none: all")
     parser.add_argument("--worlds", type=int, default=16, help="worlds of each case")
-    parser.add_argument("--run", type=Path, help="run folder or checkpoint whose swings to replay; none: random swings")
+    parser.add_argument(
+        "--run", type=Path, help="run folder or checkpoint to study; none: random swings, or pretrained/*"
+    )
     parser.add_argument("--serves", type=int, default=128, help="motors, predictor: serves of each case")
     parser.add_argument("--cases", nargs="*", choices=list(predictor.CASES), help="predictor: which; none: all")
     beside = "predictor: runs or checkpoints to measure beside the bounds"
