@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from pace.studies import parity, reaction, steps
+from pace.rl.loading import load_policy
+from pace.studies import motors, parity, reaction, steps
 from pace.studies.__main__ import main
 from pace.studies.swings import Swings, policy_swings, random_swings
 from tests.rl.saved import save_run
@@ -116,6 +117,18 @@ def test_a_policys_swings_replay_as_recorded(tmp_path: Path) -> None:
     again = steps.replay(windows, {"name": "native", "physics_dt": 0.002})
     np.testing.assert_allclose(again.joints[0], swings.qpos[1, :, 7:], atol=1e-5)
     np.testing.assert_allclose(again.joints[1], swings.qpos[2, :, 7:], atol=1e-4)
+
+
+def test_with_the_limit_no_motor_drives_over_its_line(tmp_path: Path) -> None:
+    policy = load_policy(save_run(tmp_path))
+    found = [motors.use(policy, case, 2, 2) for case in motors.CASES]
+    for use in found:
+        assert (use.serves, len(use.fastest)) == (2, 21)
+        assert (use.fast[use.fastest <= 1.0] == 0).all()
+        assert (use.fast[use.fastest > 1.0] > 0).all()
+    assert [use.case for use in found] == [motors.WITHOUT, motors.WITH]
+    assert (found[1].over == 0).all()
+    assert motors.table(found).count("\n") == 2 + len(motors.GROUPS)
 
 
 def test_the_commands_print_tables_and_write_figures(

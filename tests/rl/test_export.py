@@ -255,6 +255,17 @@ def far_blade(example: Any) -> Any:
     return example.Blade(np.array([0.0, 0.0, 9.0]), np.array([1.0, 0.0, 0.0]), np.zeros(3), np.zeros(3))
 
 
+def test_the_example_has_the_motors_of_the_training(exported: tuple[Path, dict[str, float]], example: Any) -> None:
+    meta, ours = stored(exported[0]), make_model(make_config())
+    model = example.build_model(example.SCENE, meta)
+    for name in ("gaintype", "gainprm", "biastype", "biasprm", "dyntype", "dynprm", "ctrlspec", "forcerange"):
+        np.testing.assert_allclose(getattr(model, f"actuator_{name}"), getattr(ours, f"actuator_{name}"), err_msg=name)
+    before = {name: value for name, value in meta.items() if name not in ("max_speed", "stall_torque")}
+    model = example.build_model(example.SCENE, before)  # a file from before the motors knew their speed
+    np.testing.assert_allclose(model.actuator_gainprm[:, 0], meta["kp"])
+    np.testing.assert_allclose(model.actuator_biasprm[:, 2], np.negative(meta["kd"]))
+
+
 def test_the_example_flies_the_same_ball(example: Any) -> None:
     preset = ball_preset("venue")  # with lift
     sim = BallSim(1, "cpu", BallParams.from_config(preset), preset.table, 0.002, 1, 0.002)

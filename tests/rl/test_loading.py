@@ -63,6 +63,13 @@ def test_overrides_change_a_copy() -> None:
     assert to_dict(override_task(config, [])) == to_dict(config)
 
 
+def test_a_saved_robot_keeps_its_motors_until_it_gets_new_ones() -> None:
+    saved = load_train_config(["robot.stall_ratio=0"])
+    assert override_task(saved, []).robot.stall_ratio == 0
+    assert override_task(saved, ["robot=t1"]).robot.stall_ratio == 2
+    assert override_task(saved, ["robot.stall_ratio=3", "robot=t1"]).robot.stall_ratio == 3
+
+
 @pytest.mark.parametrize(
     ("override", "message"),
     [
