@@ -28,7 +28,7 @@ import onnxruntime
 import onnxruntime.capi.onnxruntime_pybind11_state as ort  # type: ignore[import-not-found]
 
 SCENE = Path(__file__).resolve().parent.parent / "pace" / "sim" / "assets" / "scene.xml"
-FORMAT = 1  # of the metadata that is understood here
+FORMAT = 2  # of the metadata that is understood here
 GRAVITY = np.array([0.0, 0.0, -9.81])  # m/s^2
 PHYSICS_DT = 0.002  # s
 BALL_DT = 0.001  # s: a ball at 10 m/s moves by half its radius
@@ -62,8 +62,10 @@ class Controller:
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         self._session = onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
         stored = self._session.get_modelmeta().custom_metadata_map
-        if stored.get("format") != str(FORMAT):
-            raise ValueError(f"format {stored.get('format')}: no policy that PACE exported, or of another version")
+        if "format" not in stored:
+            raise ValueError("no policy that PACE exported")
+        if stored["format"] != str(FORMAT):
+            raise ValueError(f"format {stored['format']}, not {FORMAT}: export it again with this version of PACE")
         self.meta = {name: json.loads(value) for name, value in stored.items()}
         self.control_dt = float(self.meta["control_dt"])
         self.outputs: Frame = {}
@@ -83,8 +85,7 @@ class Controller:
         if not self._histories:
             self._fill(readings)
         else:
-            kept = {"previous_action": "action", "ball_moved_away": "ball_moved_away_next"}
-            frame = dict(readings) | {name: self.outputs[output] for name, output in kept.items()}
+            frame = dict(readings) | {name: self.outputs[output] for name, output in self.meta["kept"].items()}
             frame["ball_launched"] = np.array([float(new_ball)])
             for name, history in self._histories.items():
                 history[0, :-1] = history[0, 1:].copy()
