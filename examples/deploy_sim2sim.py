@@ -5,10 +5,10 @@
 
 Needs onnxruntime, mujoco and numpy, and nothing of PACE but the MJCF in pace/sim/assets. One core is enough.
 
-:class:`Controller` is what a robot runs: it keeps the histories that the file wants and calls it. The rest stands in
-for the world: :class:`Robot` is MuJoCo with the joints' position controllers and noisy, late sensors, :class:`Ball` a
-small model of flight and rebounds of its own. World frame: origin on the floor below the table's centre, x towards the
-opponent, y to the robot's left, z up. SI units.
+:class:`Controller` is what a robot runs: it keeps the histories that the file wants, some of them of its own outputs,
+and calls it. The rest stands in for the world: :class:`Robot` is MuJoCo with the joints' position controllers and
+noisy, late sensors, :class:`Ball` a small model of flight and rebounds of its own. World frame: origin on the floor
+below the table's centre, x towards the opponent, y to the robot's left, z up. SI units.
 """
 
 from __future__ import annotations
@@ -73,7 +73,10 @@ class Controller:
         self._histories: Frame = {}
 
     def restart(self) -> None:
-        """Forget the past; the next call fills every history with its frame."""
+        """Forget the past, earlier returns too: after a fall, with another paddle, not with every ball.
+
+        The next call fills every history with its frame, and what is kept of the calls before with zeros.
+        """
         self._histories = {}
 
     def __call__(self, readings: Mapping[str, Vector], new_ball: bool) -> Vector:

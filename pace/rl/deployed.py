@@ -331,9 +331,8 @@ class DeployedPolicy(nn.Module):
         }
         kept: tuple[Tensor, ...] = ()
         if self.memory is not None and return_memory is not None:
-            now = (tracks[:, -1], moved_away[:, -1:], paddle[:, -1], normal[:, -1])
-            kept = (self.memory(return_memory[:, -1], *now),)
-            # what was kept is as old as the call that it comes from: all frames but the newest one
+            kept = (self.memory(return_memory[:, -1], tracks[:, -1], moved_away[:, -1:], paddle[:, -1], normal[:, -1]),)
+            # each was the newest one of its call, so those kept are the frames before the present one, and one too old
             frames["last_return"] = torch.cat((return_memory[:, 1:], kept[0].unsqueeze(1)), dim=1)[..., -SEEN:]
         observation = torch.cat([frames[name] for name in self.names], dim=-1).flatten(1)
         action = self.policy(observation).clamp(-self.action_clip, self.action_clip)
