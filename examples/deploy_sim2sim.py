@@ -5,10 +5,10 @@
 
 Needs onnxruntime, mujoco and numpy, and nothing of PACE but the MJCF in pace/sim/assets. One core is enough.
 
-:class:`Controller` is what a robot runs: it keeps the histories that the file wants and calls it. The rest stands in
-for the world: :class:`Robot` is MuJoCo with the joints' position controllers and noisy, late sensors, :class:`Ball` a
-small model of flight and rebounds of its own. World frame: origin on the floor below the table's centre, x towards the
-opponent, y to the robot's left, z up. SI units.
+:class:`Controller` is what a robot runs: it keeps the histories that the file wants, some of them of its own outputs,
+and calls it. The rest stands in for the world: :class:`Robot` is MuJoCo with the joints' position controllers and
+noisy, late sensors, :class:`Ball` a small model of flight and rebounds of its own. World frame: origin on the floor
+below the table's centre, x towards the opponent, y to the robot's left, z up. SI units.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ import onnxruntime
 import onnxruntime.capi.onnxruntime_pybind11_state as ort  # type: ignore[import-not-found]
 
 SCENE = Path(__file__).resolve().parent.parent / "pace" / "sim" / "assets" / "scene.xml"
-FORMAT = 1  # of the metadata that is understood here
+FORMAT = 2  # of the metadata that is understood here
 GRAVITY = np.array([0.0, 0.0, -9.81])  # m/s^2
 PHYSICS_DT = 0.002  # s
 BALL_DT = 0.001  # s: a ball at 10 m/s moves by half its radius
@@ -62,8 +62,10 @@ class Controller:
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         self._session = onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
         stored = self._session.get_modelmeta().custom_metadata_map
-        if stored.get("format") != str(FORMAT):
-            raise ValueError(f"format {stored.get('format')}: no policy that PACE exported, or of another version")
+        if "format" not in stored:
+            raise ValueError("no policy that PACE exported")
+        if stored["format"] != str(FORMAT):
+            raise ValueError(f"format {stored['format']}, not {FORMAT}: export it again with this version of PACE")
         self.meta = {name: json.loads(value) for name, value in stored.items()}
         self.control_dt = float(self.meta["control_dt"])
         self.outputs: Frame = {}
@@ -71,7 +73,10 @@ class Controller:
         self._histories: Frame = {}
 
     def restart(self) -> None:
-        """Forget the past; the next call fills every history with its frame."""
+        """Forget the past, earlier returns too: after a fall, with another paddle, not with every ball.
+
+        The next call fills every history with its frame, and what is kept of the calls before with zeros.
+        """
         self._histories = {}
 
     def __call__(self, readings: Mapping[str, Vector], new_ball: bool) -> Vector:
@@ -83,8 +88,7 @@ class Controller:
         if not self._histories:
             self._fill(readings)
         else:
-            kept = {"previous_action": "action", "ball_moved_away": "ball_moved_away_next"}
-            frame = dict(readings) | {name: self.outputs[output] for name, output in kept.items()}
+            frame = dict(readings) | {name: self.outputs[output] for name, output in self.meta["kept"].items()}
             frame["ball_launched"] = np.array([float(new_ball)])
             for name, history in self._histories.items():
                 history[0, :-1] = history[0, 1:].copy()

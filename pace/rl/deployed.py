@@ -1,8 +1,9 @@
 """The policy as a robot runs it: from histories of raw sensor readings to joint targets, in one network.
 
 What :mod:`pace.rl.observations` computes step by step in N worlds is computed here at once for every frame of the
-history: the ball's track, the prediction, whether there is anything to hit, the paddle's pose. Only one bit cannot be
-read off a short history, whether the ball was seen moving away before it; it goes out of one call and into the next.
+history: the ball's track, the prediction, whether there is anything to hit, the paddle's pose. What cannot be read off
+a short history goes out of one call and into the next: the last actions, whether the ball was seen moving away before,
+and, for a policy that observes them, what the robot remembers of its returns.
 """
 
 from __future__ import annotations
@@ -15,9 +16,12 @@ from torch import Tensor, nn
 
 from pace.config import TaskConfig
 from pace.predictor.network import PredictorNetwork
+from pace.rl.deployed_memory import ReturnMemoryStep
 from pace.rl.loading import TaskPolicy
-from pace.rl.observations import JOINTS
+from pace.rl.memory import SEEN
+from pace.rl.observations import JOINTS, check_policy
 from pace.rl.policy import Policy
+from pace.rl.signal_kernels import MEMORY_SIZE
 from pace.rl.task import idle_point
 from pace.rl.task_kernels import LONGEST_TIME
 from pace.sim.robot import TRUNK_BODY, nominal_pose
@@ -34,7 +38,7 @@ class Port(NamedTuple):
     meaning: str
 
 
-#: Inputs (N, frames, size), oldest frame first; :func:`input_shapes` says how many frames.
+#: Inputs (N, frames, size) of every policy, oldest frame first; :func:`input_shapes` says how many frames.
 INPUTS = {
     "base_angular_velocity": Port(3, "rad/s", "gyroscope of the trunk, body frame"),
     "base_position": Port(3, "m", "trunk, world frame"),
@@ -45,9 +49,9 @@ INPUTS = {
     "previous_action": Port(JOINTS, "1", "the output action of the calls before; zeros before the first one"),
     "ball_position": Port(3, "m", "centre of the ball, world frame"),
     "ball_launched": Port(1, "0 or 1", "1 in the frame in which a new ball is seen first"),
-    "ball_moved_away": Port(1, "0 or 1", "the output ball_moved_away of the call before; 0 at the first one"),
+    "ball_moved_away": Port(1, "0 or 1", "the output ball_moved_away_next of the call before; 0 at the first one"),
 }
-#: Outputs (N, size).
+#: Outputs (N, size) of every policy.
 OUTPUTS = {
     "joint_target": Port(JOINTS, "rad", "targets of the joints' position control until the next call"),
     "action": Port(JOINTS, "1", "kept by the caller as previous_action of the next call"),
@@ -55,10 +59,44 @@ OUTPUTS = {
     "predicted_target": Port(3, "m", "where the paddle is to meet the ball, likewise"),
     "predicted_time": Port(1, "s", "until the ball is at the target; 0 while there is nothing to hit"),
     "something_to_hit": Port(1, "0 or 1", "the ball can still be hit, as far as the robot can know"),
-    "ball_moved_away": Port(1, "0 or 1", "kept by the caller for the next call"),
+    "ball_moved_away_next": Port(1, "0 or 1", "kept by the caller for the next call"),
 }
-#: An ONNX graph has one name space: the bit that comes back has another name outside.
-OUTPUT_NAMES = tuple("ball_moved_away_next" if name in INPUTS else name for name in OUTPUTS)
+#: Inputs and outputs besides, of a policy that observes ``last_return``.
+MEMORY_INPUTS = {
+    "return_memory": Port(
+        MEMORY_SIZE, "m, m/s, 1", "the output return_memory_next of the calls before; zeros before the first one"
+    ),
+}
+MEMORY_OUTPUTS = {
+    "return_memory_next": Port(
+        MEMORY_SIZE,
+        "m, m/s, 1",
+        "kept by the caller as return_memory of the next call; the last five: velocity of the last return, restitution "
+        "of paddle and ball above the prior, share of hits that it is known from",
+    ),
+}
+#: Input -> the output of the calls before that it is made of. An ONNX graph has one name space, hence the other names.
+KEPT = {"previous_action": "action", "ball_moved_away": "ball_moved_away_next", "return_memory": "return_memory_next"}
+
+
+def remembers(config: TaskConfig) -> bool:
+    """Whether the policy observes how its returns left the paddle."""
+    return "last_return" in config.observation.policy
+
+
+def input_ports(config: TaskConfig) -> dict[str, Port]:
+    """The policy's inputs, in order."""
+    return INPUTS | MEMORY_INPUTS if remembers(config) else dict(INPUTS)
+
+
+def output_ports(config: TaskConfig) -> dict[str, Port]:
+    """The policy's outputs, in order."""
+    return OUTPUTS | MEMORY_OUTPUTS if remembers(config) else dict(OUTPUTS)
+
+
+def kept_outputs(config: TaskConfig) -> dict[str, str]:
+    """Input -> output of the call before that is its newest frame; zeros before the first call."""
+    return {name: output for name, output in KEPT.items() if name in input_ports(config)}
 
 
 def input_shapes(config: TaskConfig) -> dict[str, tuple[int, int]]:
@@ -66,7 +104,7 @@ def input_shapes(config: TaskConfig) -> dict[str, tuple[int, int]]:
     frames = config.observation.policy_history
     longer = frames + config.predictor.frames - 1
     count = {"ball_position": longer, "ball_launched": longer, "ball_moved_away": 1}
-    return {name: (count.get(name, frames), port.size) for name, port in INPUTS.items()}
+    return {name: (count.get(name, frames), port.size) for name, port in input_ports(config).items()}
 
 
 class PaddleChain(nn.Module):
@@ -154,7 +192,7 @@ class BallTracks(nn.Module):
 
     def forward(self, position: Tensor, launched: Tensor, moved_away: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Positions (N, L, 3) m, flags (N, L, 1) and (N, 1, 1) -> tracks (N, H, 3 frames), something to hit (N, H)
-        bool, and the bit for the next call (N, 1) bool. L = H + frames - 1.
+        bool, and moved away (N, H) bool. L = H + frames - 1.
         """
         track = position[:, :1].repeat(1, self.frames, 1)
         gone = moved_away[:, 0] > 0.5
@@ -170,8 +208,7 @@ class BallTracks(nn.Module):
             tracks.append(track.flatten(1))
             hittable.append(~(gone | self._nothing_to_hit(track[:, -1], change)))
             bits.append(gone)
-        # the next call's history begins one frame later
-        return torch.stack(tracks, dim=1), torch.cat(hittable, dim=1), bits[0]
+        return torch.stack(tracks, dim=1), torch.cat(hittable, dim=1), torch.cat(bits, dim=1)
 
     def _nothing_to_hit(self, position: Tensor, change: Tensor) -> Tensor:
         x, z = position[:, :1], position[:, 2:]
@@ -231,11 +268,12 @@ class PredictionReader(nn.Module):
 class DeployedPolicy(nn.Module):
     """Normaliser, predictor and actor, and all that lies between a robot's raw readings and them.
 
-    Inputs in the order of ``INPUTS``, each (N, frames, size) float32 as :func:`input_shapes` says; outputs in the order
-    of ``OUTPUTS``, each (N, size).
+    Inputs in the order of :func:`input_ports`, each (N, frames, size) float32 as :func:`input_shapes` says; outputs in
+    the order of :func:`output_ports`, each (N, size).
 
     Args: policy as :func:`pace.rl.load_policy` gives it; model of the robot, for the paddle's kinematics.
-    Errors: ``TypeError`` for a built-in policy, which is no network.
+    Errors: ``TypeError`` for a built-in policy, which is no network; :class:`pace.config.ConfigError` for observations
+    that nobody computes.
     """
 
     def __init__(self, policy: TaskPolicy, model: mujoco.MjModel) -> None:
@@ -243,10 +281,13 @@ class DeployedPolicy(nn.Module):
         if not isinstance(policy.act, Policy):
             raise TypeError(f"policy {policy.source} is no network: only a saved policy can be deployed")
         config = policy.config
+        check_policy(config.observation, config.predictor)
         self.policy = policy.act
         self.tracks = BallTracks(config)
         self.reader = PredictionReader(config, policy.predictor)
         self.chain = PaddleChain(model)
+        numbers = config.observation.return_memory
+        self.memory = ReturnMemoryStep(numbers, config.robot.control_dt) if numbers and remembers(config) else None
         self.names = list(config.observation.policy)
         self.action_scale, self.action_clip = config.robot.action_scale, config.robot.action_clip
         self.register_buffer("nominal", torch.tensor(nominal_pose(config.robot), dtype=torch.float32))
@@ -265,6 +306,7 @@ class DeployedPolicy(nn.Module):
         ball_position: Tensor,
         ball_launched: Tensor,
         ball_moved_away: Tensor,
+        return_memory: Tensor | None = None,
     ) -> tuple[Tensor, ...]:
         """See the class."""
         tracks, hittable, moved_away = self.tracks(ball_position, ball_launched, ball_moved_away)
@@ -287,8 +329,13 @@ class DeployedPolicy(nn.Module):
             "predicted_time": prediction.time,
             "something_to_hit": hittable.unsqueeze(-1).float(),
         }
+        kept: tuple[Tensor, ...] = ()
+        if self.memory is not None and return_memory is not None:
+            kept = (self.memory(return_memory[:, -1], tracks[:, -1], moved_away[:, -1:], paddle[:, -1], normal[:, -1]),)
+            # each was the newest one of its call, so those kept are the frames before the present one, and one too old
+            frames["last_return"] = torch.cat((return_memory[:, 1:], kept[0].unsqueeze(1)), dim=1)[..., -SEEN:]
         observation = torch.cat([frames[name] for name in self.names], dim=-1).flatten(1)
         action = self.policy(observation).clamp(-self.action_clip, self.action_clip)
         seen = (prediction.apex[:, -1], prediction.target[:, -1], prediction.time[:, -1])
-        flags = (hittable[:, -1:].float(), moved_away.float())
-        return self.nominal + self.action_scale * action, action, *seen, *flags
+        flags = (hittable[:, -1:].float(), moved_away[:, :1].float())  # the next history begins one frame later
+        return self.nominal + self.action_scale * action, action, *seen, *flags, *kept

@@ -31,25 +31,26 @@ from torch import Tensor
 from pace.command import run_command
 from pace.config import ExportConfig, TrainConfig, parse, to_dict
 from pace.rl.checkpoint import CheckpointError
-from pace.rl.deployed import INPUTS, OUTPUT_NAMES, OUTPUTS, DeployedPolicy, input_shapes
+from pace.rl.deployed import DeployedPolicy, input_ports, input_shapes, kept_outputs, output_ports, remembers
 from pace.rl.env import TableTennisEnv
 from pace.rl.loading import TaskPolicy, load_policy
 from pace.rl.observations import POLICY, layout
 from pace.rl.run_folder import VERSIONS, git_state, versions
 from pace.sim.robot import JOINT_NAMES, build_model, joint_gains, motor_lines, nominal_pose
 
-FORMAT = 1  # of the metadata
+FORMAT = 2  # of the metadata; 2: kept says which outputs the caller keeps
 ACTION_NOISE = 0.3  # standard deviation added to the actions while observations are recorded, so that they vary
 #: The check plays the task as saved, but for noise that is added to what the graph itself computes.
 CHECK_OVERRIDES = ("sensing.base_shift=0.0", "engine=native", "engine.threads=1")
 #: What lies outside the file.
 PROCEDURE = (
-    "Run at 1 / control_dt Hz. Keep a history of each input, oldest frame first, and append a frame before each call. "
-    "At the start fill every history with the first frame, previous_action, ball_launched and ball_moved_away with 0. "
-    "A new ball is a new track: set ball_launched to 1 in the frame in which it is first seen. Without a ball in view, "
-    "repeat its last position. Send joint_target to the position controllers with the gains kp and kd, and keep action "
-    "and ball_moved_away_next for the next call. World frame: origin on the floor below the table's centre, x towards "
-    "the opponent, y to the robot's left, z up."
+    "Run at 1 / control_dt Hz. Keep a history of each input, oldest frame first, and append a frame before each call: "
+    "of the inputs named in kept, the output of the last call that stands beside them there. At the start fill every "
+    "history with the first frame, but those of kept and ball_launched with 0. A new ball is a new track: set "
+    "ball_launched to 1 in the frame in which it is first seen. Without a ball in view, repeat its last position. "
+    "Start anew after a fall and with another paddle, not with every ball. Send joint_target to the position "
+    "controllers with the gains kp and kd. World frame: origin on the floor below the table's centre, x towards the "
+    "opponent, y to the robot's left, z up."
 )
 
 Session = Any  # onnxruntime has no type information
@@ -74,10 +75,11 @@ def export_from_config(composed: DictConfig) -> None:
         raise ExportError(f"{out} is a folder: give the name of a file, such as out={out / 'policy.onnx'}")
     differences = export_policy(policy, out, config)
     count = config.check_worlds * config.check_steps
+    units = output_ports(policy.config)
     print(f"policy {policy.source}")
     print(f"largest difference between onnxruntime and torch over {count:,} recorded observations:")
     for name, value in differences.items():
-        print(f"  {name:<18}{value:.1e} {OUTPUTS[name].unit}")
+        print(f"  {name:<20}{value:.1e} {units[name].unit}")
     print(f"wrote {out} ({out.stat().st_size / 2**20:.2f} MiB)")
 
 
@@ -128,8 +130,8 @@ def save_graph(graph: DeployedPolicy, config: TrainConfig, file: Path) -> None:
             graph,
             example,
             dynamo=True,
-            input_names=list(INPUTS),
-            output_names=list(OUTPUT_NAMES),
+            input_names=list(input_ports(config)),
+            output_names=list(output_ports(config)),
             dynamic_shapes=tuple({0: robots} for _ in example),
             verbose=False,
         )
@@ -162,7 +164,6 @@ def metadata(policy: TaskPolicy, differences: Mapping[str, float], options: Expo
     max_speed, stall_torque = (None, None) if lines is None else lines.tolist()
     model = build_model(config.robot, config.engine, config.ball.table)
     shapes = input_shapes(config)
-    outputs = zip(OUTPUT_NAMES, OUTPUTS.values(), strict=True)
     columns = layout(config.observation.policy, POLICY)
     return {
         "format": FORMAT,
@@ -179,8 +180,9 @@ def metadata(policy: TaskPolicy, differences: Mapping[str, float], options: Expo
         "action_scale": config.robot.action_scale,
         "action_clip": config.robot.action_clip,
         "control_dt": config.robot.control_dt,
-        "inputs": {name: {"shape": shapes[name], **port._asdict()} for name, port in INPUTS.items()},
-        "outputs": {name: port._asdict() for name, port in outputs},
+        "inputs": {name: {"shape": shapes[name], **port._asdict()} for name, port in input_ports(config).items()},
+        "outputs": {name: port._asdict() for name, port in output_ports(config).items()},
+        "kept": kept_outputs(config),
         "observation": {
             "history": config.observation.policy_history,
             "frame": {name: [where.start, where.stop] for name, where in columns.items()},
@@ -216,7 +218,7 @@ class RawReadings:
     """
 
     def __init__(self, env: TableTennisEnv, config: TrainConfig) -> None:
-        self.env = env
+        self.env, self.kept = env, kept_outputs(config)
         shapes = input_shapes(config)
         self.histories = {name: torch.zeros(env.num_worlds, *shape) for name, shape in shapes.items()}
         self.fill(torch.ones(env.num_worlds, dtype=torch.bool))
@@ -230,9 +232,10 @@ class RawReadings:
         frame["previous_action"] = env.task_state.action
         return frame
 
-    def push(self, new_ball: Tensor, moved_away: Tensor) -> None:
-        """Append the present frame; ``new_ball`` (N,) bool, ``moved_away`` (N, 1) is the graph's last output."""
-        frame = self.read() | {"ball_launched": new_ball.float().unsqueeze(-1), "ball_moved_away": moved_away}
+    def push(self, new_ball: Tensor, outputs: Mapping[str, NDArray[np.float32]]) -> None:
+        """Append the present frame; ``new_ball`` (N,) bool, ``outputs`` of the graph's last call, each (N, size)."""
+        kept = {name: torch.from_numpy(outputs[output]) for name, output in self.kept.items()}
+        frame = kept | self.read() | {"ball_launched": new_ball.float().unsqueeze(-1)}  # the action is what was done
         for name, history in self.histories.items():
             history.copy_(torch.cat((history[:, 1:], frame[name].unsqueeze(1)), dim=1))
 
@@ -240,7 +243,7 @@ class RawReadings:
         """Start anew in the worlds of ``mask`` (N,) bool."""
         for name, value in self.read().items():
             self.histories[name][mask] = value[mask].unsqueeze(1)
-        for name in ("ball_launched", "ball_moved_away"):
+        for name in ("ball_launched", *self.kept):
             self.histories[name][mask] = 0.0
 
     def numpy(self) -> dict[str, NDArray[np.float32]]:
@@ -264,29 +267,30 @@ def compare(session: Session, policy: TaskPolicy, config: ExportConfig) -> dict[
     Worlds play with the policy and some noise on its actions; serves follow one another and robots fall.
     """
     env = policy.make_env(config.check_worlds, "cpu", config.seed, CHECK_OVERRIDES)
-    readings = RawReadings(env, policy.config)
+    readings, names = RawReadings(env, policy.config), list(output_ports(policy.config))
     generator = torch.Generator().manual_seed(config.seed)
-    largest = dict.fromkeys(OUTPUTS, 0.0)
+    largest = dict.fromkeys(names, 0.0)
     for _ in range(config.check_steps):
-        found = dict(zip(OUTPUTS, session.run(None, readings.numpy()), strict=True))
+        found = dict(zip(names, session.run(None, readings.numpy()), strict=True))
         action = policy(env.policy_observation)
         expected = expected_outputs(env, policy, action)
         for name, value in expected.items():
-            difference = float(np.abs(found[name] - value.numpy()).max())
+            difference = float(np.abs(found[name][:, -value.shape[1] :] - value.numpy()).max())
             largest[name] = difference if np.isnan(difference) else max(largest[name], difference)
         env.advance(action + ACTION_NOISE * torch.randn(action.shape, generator=generator))
         done = env.terminated | env.truncated
-        readings.push(env.game.ends.next_serve, torch.from_numpy(found["ball_moved_away"]))
+        readings.push(env.game.ends.next_serve, found)
         env.reset_worlds(done)
         readings.fill(done)
     return {name: largest[name] for name in expected_outputs(env, policy, policy(env.policy_observation))}
 
 
 def expected_outputs(env: TableTennisEnv, policy: TaskPolicy, action: Tensor) -> dict[str, Tensor]:
-    """The graph's outputs by name, as far as the environment has them."""
+    """The graph's outputs by name, as far as the environment has them; of the memory its last numbers alone: the rest
+    differs after a reset, when the graph has seen the paddle once and the environment has not yet."""
     robot, actor = policy.config.robot, env.actor
     clipped = action.clamp(-robot.action_clip, robot.action_clip)
-    return {
+    outputs = {
         "joint_target": env.worlds.nominal + robot.action_scale * clipped,
         "action": clipped,
         "predicted_apex": actor.apex,
@@ -294,6 +298,9 @@ def expected_outputs(env: TableTennisEnv, policy: TaskPolicy, action: Tensor) ->
         "predicted_time": actor.time.unsqueeze(-1),
         "something_to_hit": actor.track.something_to_hit.float().unsqueeze(-1),
     }
+    if actor.memory is not None and remembers(policy.config):
+        outputs["return_memory_next"] = actor.memory.seen
+    return outputs
 
 
 if __name__ == "__main__":

@@ -155,7 +155,10 @@ def remember_return(
     rules: MemoryRules,
     memory: wp.array2d[wp.float32],
 ):
-    """One control step of a world's memory; ``track`` holds the ball's last positions, oldest first."""
+    """One control step of a world's memory; ``track`` holds the ball's last positions, oldest first.
+
+    :class:`pace.rl.deployed_memory.ReturnMemoryStep` does the same in an exported policy.
+    """
     world = wp.tid()
     row, ball = memory[world], track[world]
     newest = ball.shape[0] - 3

@@ -1,7 +1,8 @@
-"""Runs on disk without training: small networks with random weights."""
+"""Runs on disk without training: small networks with random weights; and a trained policy that sees more."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -11,8 +12,9 @@ from torch import Tensor
 from pace.config import TrainConfig, load_train_config, to_dict
 from pace.predictor.network import PredictorNetwork
 from pace.rl.checkpoint import Checkpoint, save_checkpoint
-from pace.rl.loading import policy_size
-from pace.rl.policy import Agent
+from pace.rl.loading import TaskPolicy, load_policy, policy_size
+from pace.rl.observations import POLICY, layout
+from pace.rl.policy import Agent, Policy
 
 OVERRIDES = ("algo.actor_hidden=[8]", "algo.critic_hidden=[8]", "algo.autocast=fp32", "reward.scale=0.125")
 
@@ -45,3 +47,31 @@ def save_run(path: Path, agent: dict[str, Tensor] | None = None, without: str = 
     checkpoint = Checkpoint(to_dict(config), {"updates": 3, "samples": 99, "wall_s": 1.0}, weights, None)
     save_checkpoint(path / "checkpoints" / "update_00000003", checkpoint)
     return path
+
+
+def remembering_policy(weight: float = 0.01) -> TaskPolicy:
+    """``pretrained/wide``, which hits, with the observations of ``observation=memory``.
+
+    The new inputs have random weights of the size ``weight``, and are not normalised.
+    """
+    old = load_policy("pretrained/wide")
+    assert isinstance(old.act, Policy)
+    config = replace(old.config, observation=load_train_config(["observation=memory"]).observation)
+    frame, history = config.observation.policy, config.observation.policy_history
+    assert [name for name in frame if name != "last_return"] == old.config.observation.policy
+    old_columns = torch.ones(policy_size(config) // history, dtype=torch.bool)
+    old_columns[layout(frame, POLICY)["last_return"]] = False
+    old_columns = old_columns.repeat(history)
+    network = Policy.build(policy_size(config), 21, config.algo)
+    weights = old.act.state_dict()
+    torch.manual_seed(5)
+    for name, like in (
+        ("mlp.layers.0.weight", weight * torch.randn(config.algo.actor_hidden[0], len(old_columns))),
+        ("norm.mean", torch.zeros(len(old_columns))),
+        ("norm.var", torch.ones(len(old_columns))),
+    ):
+        wide = like.to(weights[name].dtype)
+        wide[..., old_columns] = weights[name]
+        weights[name] = wide
+    network.load_state_dict(weights)
+    return TaskPolicy(config, network.requires_grad_(False).eval(), old.predictor, "remembering")

@@ -16,12 +16,22 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from saved import make_agent, make_config, save_run
+from saved import make_agent, make_config, remembering_policy, save_run
 
 from pace.config import ConfigError, ExportConfig, TrainConfig, compose, load_train_config, parse
 from pace.predictor.network import PredictorNetwork
 from pace.rl import export
-from pace.rl.deployed import INPUTS, OUTPUT_NAMES, BallTracks, DeployedPolicy, PaddleChain, base_rotation, input_shapes
+from pace.rl.deployed import (
+    INPUTS,
+    OUTPUTS,
+    BallTracks,
+    DeployedPolicy,
+    PaddleChain,
+    base_rotation,
+    input_ports,
+    input_shapes,
+    output_ports,
+)
 from pace.rl.export import ExportError, RawReadings, compare, export_policy, open_session, training_versions
 from pace.rl.loading import TaskPolicy, built_in_policy, load_policy, policy_size
 from pace.rl.observations import BallTrack
@@ -55,6 +65,14 @@ def exported(run: Path) -> tuple[Path, dict[str, float]]:
 
 
 @pytest.fixture(scope="module")
+def remembering(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TaskPolicy, dict[str, float]]:
+    """The file of a policy that hits and observes its returns, the policy, and how far they are from each other."""
+    pytest.importorskip("onnxscript")
+    file, policy = tmp_path_factory.mktemp("remembering") / "policy.onnx", remembering_policy()
+    return file, policy, export_policy(policy, file, options())
+
+
+@pytest.fixture(scope="module")
 def example() -> Any:
     """The example as a module."""
     spec = spec_from_file_location("deploy_sim2sim", EXAMPLE)
@@ -77,7 +95,7 @@ def test_it_computes_what_the_task_computes(exported: tuple[Path, dict[str, floa
     assert max(differences.values()) < 1e-5
     session = open_session(file)
     assert [port.name for port in session.get_inputs()] == list(INPUTS)
-    assert tuple(port.name for port in session.get_outputs()) == OUTPUT_NAMES
+    assert [port.name for port in session.get_outputs()] == list(OUTPUTS)
     assert stored(file)["check"]["largest_difference"] == differences
     assert list(file.parent.glob(".export_*")) == []
 
@@ -100,6 +118,7 @@ def test_the_metadata_is_what_a_robot_needs(exported: tuple[Path, dict[str, floa
     assert meta["observation"]["history"] * meta["observation"]["frame"]["something_to_hit"][1] == policy_size(config)
     assert meta["inputs"]["ball_position"]["shape"] == [9, 3]
     assert {name: tuple(port["shape"]) for name, port in meta["inputs"].items()} == input_shapes(config)
+    assert meta["kept"] == {"previous_action": "action", "ball_moved_away": "ball_moved_away_next"}
     assert meta["counters"]["updates"] == 3
     assert meta["source"].startswith(str(run))
     assert len(meta["git"]["commit"]) == 40
@@ -130,11 +149,11 @@ class TorchSession:
     """The graph before it became a file."""
 
     def __init__(self, policy: TaskPolicy) -> None:
-        self.graph = DeployedPolicy(policy, make_model(policy.config))
+        self.graph, self.names = DeployedPolicy(policy, make_model(policy.config)), input_ports(policy.config)
 
     @torch.no_grad()
     def run(self, _: None, inputs: dict[str, np.ndarray]) -> list[np.ndarray]:
-        return [output.numpy() for output in self.graph(*(torch.from_numpy(inputs[name]) for name in INPUTS))]
+        return [output.numpy() for output in self.graph(*(torch.from_numpy(inputs[name]) for name in self.names))]
 
 
 @pytest.mark.parametrize(
@@ -149,6 +168,54 @@ def test_other_tasks_have_their_own_graph(overrides: tuple[str, ...]) -> None:
     policy = fresh_policy(overrides)
     differences = compare(TorchSession(policy), policy, options("check_steps=60"))
     assert max(differences.values()) < 1e-5
+
+
+class Forgetful(TorchSession):
+    """The graph of a caller who does not keep the memory."""
+
+    def run(self, _: None, inputs: dict[str, np.ndarray]) -> list[np.ndarray]:
+        return super().run(None, inputs | {"return_memory": np.zeros_like(inputs["return_memory"])})
+
+
+class Watched:
+    """A file in onnxruntime. Attribute: ``seen`` (4, 5), the largest that came back to each world from the memory."""
+
+    def __init__(self, file: Path) -> None:
+        self.session, self.seen = open_session(file), np.zeros((4, 5))
+
+    def run(self, names: None, inputs: dict[str, np.ndarray]) -> list[np.ndarray]:
+        self.seen = np.maximum(self.seen, np.abs(inputs["return_memory"][:, 0, -5:]))
+        return self.session.run(names, inputs)
+
+
+def test_a_policy_that_remembers_its_returns(remembering: tuple[Path, TaskPolicy, dict[str, float]]) -> None:
+    file, policy, differences = remembering
+    assert max(differences.values()) < 1e-4
+    assert list(differences)[-1] == "return_memory_next"
+    session, meta = open_session(file), stored(file)
+    assert (
+        [port.name for port in session.get_inputs()] == list(input_ports(policy.config)) == [*INPUTS, "return_memory"]
+    )
+    assert [port.name for port in session.get_outputs()] == list(output_ports(policy.config))
+    assert meta["inputs"]["return_memory"]["shape"] == [5, 24]
+    assert meta["kept"]["return_memory"] == "return_memory_next"
+
+
+def test_returns_are_seen_while_it_is_compared(remembering: tuple[Path, TaskPolicy, dict[str, float]]) -> None:
+    """Serves are returned in the recorded observations, and what is remembered of them changes the action."""
+    file, policy, _ = remembering
+    watched = Watched(file)
+    assert max(compare(watched, policy, options()).values()) < 1e-4
+    assert (watched.seen > 0.0).all(axis=1).sum() >= 2
+    assert compare(Forgetful(policy), policy, options())["action"] > 0.01
+
+
+def test_memory_and_one_frame_of_history() -> None:
+    policy = fresh_policy(["observation=memory", "observation.policy_history=1"])
+    assert max(compare(TorchSession(policy), policy, options("check_steps=60")).values()) < 1e-5
+    unused = fresh_policy(["observation=memory", "observation.policy=[base_position]"])
+    assert list(input_ports(unused.config)) == list(INPUTS)
+    assert max(compare(TorchSession(unused), unused, options("check_steps=5")).values()) < 1e-5
 
 
 def test_a_wrong_file_is_not_kept(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -220,17 +287,17 @@ def test_the_ball_is_followed_as_in_the_task() -> None:
         track.update(sensed, new)
         positions = torch.cat((positions[:, 1:], sensed.unsqueeze(1)), dim=1)
         launched = torch.cat((launched[:, 1:], new.float().view(-1, 1, 1)), dim=1)
-        tracks, hittable, next_bit = graph(positions, launched, bit.unsqueeze(1))
-        bit = next_bit.float()
+        tracks, hittable, turned = graph(positions, launched, bit.unsqueeze(1))
+        bit = turned[:, :1].float()
+        assert torch.equal(turned[:, -1], track.turned)
         assert torch.equal(tracks[:, -1], track.positions)
         assert torch.equal(hittable[:, -1], track.something_to_hit)
         seen += int(track.something_to_hit.sum())
     assert 0.2 < seen / (60 * worlds) < 0.8  # both answers were asked for
 
 
-def test_the_example_gives_the_targets_of_the_task(exported: tuple[Path, dict[str, float]], example: Any) -> None:
-    controller = example.Controller(exported[0])
-    policy = load_policy(exported[0].parent)
+def follow(controller: Any, policy: TaskPolicy) -> int:
+    """Play the task beside the example's controller, which must say the same; balls after the first, and falls."""
     env = policy.make_env(1, "cpu", 4, ["sensing.base_shift=0.0", "engine.threads=1", "serve.serves_per_episode=0"])
     new_ball, restarts, serves = False, 0, 0
     for _ in range(200):
@@ -247,7 +314,31 @@ def test_the_example_gives_the_targets_of_the_task(exported: tuple[Path, dict[st
             env.reset_worlds(env.terminated)
             controller.restart()
             restarts += 1
-    assert restarts + serves > 0
+    return restarts + serves
+
+
+def test_the_example_gives_the_targets_of_the_task(exported: tuple[Path, dict[str, float]], example: Any) -> None:
+    assert follow(example.Controller(exported[0]), load_policy(exported[0].parent)) > 0
+
+
+def test_the_example_remembers_its_returns(
+    remembering: tuple[Path, TaskPolicy, dict[str, float]], example: Any
+) -> None:
+    controller = example.Controller(remembering[0])
+    assert follow(controller, remembering[1]) > 0
+    assert np.abs(controller.outputs["return_memory_next"][-5:]).min() > 0.0
+
+
+def test_the_example_refuses_files_of_other_versions(
+    exported: tuple[Path, dict[str, float]], example: Any, tmp_path: Path
+) -> None:
+    import onnx
+
+    model = onnx.load(str(exported[0]))
+    onnx.helper.set_model_props(model, {"format": "1"})
+    onnx.save(model, str(tmp_path / "old.onnx"))
+    with pytest.raises(ValueError, match="format 1, not 2: export it again"):
+        example.Controller(tmp_path / "old.onnx")
 
 
 def far_blade(example: Any) -> Any:

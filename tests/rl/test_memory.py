@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from pace.config import ConfigError, ReturnMemoryConfig
+from pace.rl.deployed_memory import ReturnMemoryStep
 from pace.rl.env import make_env
 from pace.rl.memory import GRAVITY, SEEN, ReturnMemory
 from pace.rl.observations import check_policy
@@ -108,6 +109,30 @@ def test_it_can_be_forgotten_world_by_world() -> None:
     assert rally.memory.state.abs().max() > 0.0
     rally.memory.restart(torch.tensor([True]))
     assert rally.memory.state.abs().max() == 0.0
+
+
+def test_the_exported_memory_is_the_kernels() -> None:
+    torch.manual_seed(6)
+    worlds, teaching = 512, 0
+    track, turned = torch.zeros(worlds, 18), torch.zeros(worlds, dtype=torch.bool)  # one frame more than it needs
+    paddle, normal = torch.zeros(worlds, 3), torch.zeros(worlds, 3)
+    memory = ReturnMemory(CONFIG, DT, track, turned, paddle, normal)
+    graph, state = ReturnMemoryStep(CONFIG, DT), torch.zeros(worlds, 24)
+    for _ in range(60):
+        # balls at some 5 m/s, within reach of the paddle and not, turned for a few steps and then new
+        paddle.copy_(POINT + 0.05 * torch.randn(worlds, 3))
+        track.copy_((POINT + 0.2 * torch.randn(worlds, 6, 3)).flatten(1))
+        normal.copy_(torch.nn.functional.normalize(NORMAL + 0.5 * torch.randn(worlds, 3), dim=1))
+        turned.copy_(torch.where(turned, torch.rand(worlds) < 0.8, torch.rand(worlds) < 0.5))
+        before = memory.seen.clone()
+        memory.update()
+        state = graph(state, track, turned.unsqueeze(1), paddle, normal)
+        assert torch.allclose(state, memory.state, rtol=1e-5, atol=1e-4)
+        teaching += int((memory.seen[:, 3] != before[:, 3]).sum())
+        of_paddle = memory.state[:, 0] == 1.0
+        assert of_paddle.any()
+        assert (turned & ~of_paddle).any()
+    assert 1000 < teaching < 0.2 * 60 * worlds
 
 
 def test_the_actor_remembers_over_serves_and_forgets_with_the_episode() -> None:

@@ -1,0 +1,63 @@
+"""The memory of returns (:mod:`pace.rl.memory`) in torch, so that it can be part of an exported policy."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from pace.config import ReturnMemoryConfig
+from pace.rl.memory import GRAVITY
+from pace.rl.signal_kernels import AGE, BEFORE, NORMAL_1, POSITION_1, POSITION_2, RETURN
+
+
+class ReturnMemoryStep(nn.Module):
+    """One control step of the memory, as the kernel :func:`pace.rl.signal_kernels.remember_return` computes it.
+
+    Args: config: numbers of the estimate; control_dt: s.
+    """
+
+    def __init__(self, config: ReturnMemoryConfig, control_dt: float) -> None:
+        super().__init__()
+        self.config, self.span = config, 2.0 * control_dt
+        # in the two steps to the hit, and from it
+        self.register_buffer("fall", torch.tensor([0.0, 0.0, self.span * GRAVITY]))
+
+    fall: Tensor
+
+    def forward(self, memory: Tensor, track: Tensor, turned: Tensor, paddle: Tensor, normal: Tensor) -> Tensor:
+        """The memory (N, 24) after this step.
+
+        Args: memory (N, 24) before it; track (N, 3 * frames) m, the ball's last positions, oldest first; turned (N, 1)
+        bool, the ball has been seen moving away; paddle (N, 3) m and normal (N, 3) of the paddle.
+        """
+        ball = track.unflatten(1, (-1, 3))
+        newest, speed = ball[:, -1], (ball[:, -1] - ball[:, -3]) / self.span
+        age = torch.where(turned, (memory[:, AGE : AGE + 1] + 1.0).clamp(max=4.0), 0.0)
+        turning, leaving = age == 1.0, age == 3.0
+        before = (ball[:, -3] - ball[:, -5]) / self.span - self.fall
+        swing = (paddle - memory[:, POSITION_2:NORMAL_1]) / self.span
+        hit = torch.cat((before, swing, memory[:, NORMAL_1:BEFORE]), dim=1)
+        hit = torch.where(turning, hit, memory[:, BEFORE:RETURN])
+        far = (newest - paddle).square().sum(1, keepdim=True).sqrt() > self.config.reach
+        age = torch.where(turning & far, 4.0, age)  # not the paddle turned it
+        seen = torch.where(leaving, self._learn(hit, speed, memory[:, RETURN:]), memory[:, RETURN:])
+        return torch.cat((age, paddle, memory[:, POSITION_1:POSITION_2], normal, hit, seen), dim=1)
+
+    def _learn(self, hit: Tensor, after: Tensor, seen: Tensor) -> Tensor:
+        """What is seen (N, 5) with one more estimate.
+
+        Args: hit (N, 9): velocity of the ball before it and of the paddle, m/s, and the paddle's normal; after (N, 3)
+        m/s, velocity of the return; seen (N, 5) so far.
+        """
+        config = self.config
+        before, paddle, normal = hit.split(3, dim=1)
+        restitution, share = seen[:, 3:4], seen[:, 4:5]
+        closing = ((before - paddle) * normal).sum(1, keepdim=True)
+        parting = ((after + self.fall - paddle) * normal).sum(1, keepdim=True)
+        fast = closing.abs() >= config.closing_speed
+        estimate = (-parting / torch.where(fast, closing, 1.0)).clamp(0.0, config.largest)
+        hits = (share * config.hits).clamp(max=config.hits - 1.0)  # older ones fade once there are that many
+        weight = hits + config.prior_hits
+        mean = (restitution * weight + estimate - config.prior) / (weight + 1.0)
+        learned = torch.cat((mean, (hits + 1.0) / config.hits), dim=1)
+        return torch.cat((after, torch.where(fast, learned, seen[:, 3:])), dim=1)
