@@ -275,7 +275,7 @@ class TableTennisEnv(EnvBase):
         return sums | {f"reward/{name}": value for name, value in terms.items()}
 
     def _parts(self) -> dict[str, object]:
-        memory = {} if self.actor.memory is None else {"memory": self.actor.memory}
+        memory: dict[str, object] = {} if self.actor.memory is None else {"memory": self.actor.memory}
         return memory | {
             "state": self.task_state,
             "sensing": self.sensing,

@@ -18,6 +18,7 @@ KP, KD, EFFORT = joint_gains(CONFIG.robot)
 LINES = motor_lines(CONFIG.robot)
 assert LINES is not None
 SPEED, STALL = LINES
+Factor = float | np.ndarray  # of all worlds, or (N, 1)
 #: Of 18 N m, light enough to reach its greatest speed within its range.
 JOINT = JOINT_NAMES.index("Right_Elbow_Yaw")
 
@@ -34,8 +35,9 @@ def built(request):
     return make(request.param)
 
 
-def torques(engine, model, offset, speed):
+def torques(built, offset, speed):
     """What the motors give at ``speed`` (N, 21) rad/s, ``offset`` (N, 21) rad before their targets."""
+    engine, model = built
     qpos = torch.as_tensor(model.key_qpos, dtype=torch.float32).repeat(WORLDS, 1)
     qpos[:, 2] += 1.0
     qvel = torch.zeros(WORLDS, 27)
@@ -45,7 +47,7 @@ def torques(engine, model, offset, speed):
     return engine.joint_torque.double().numpy()
 
 
-def law(offset, speed, kp=1.0, kd=1.0, effort=1.0):
+def law(offset, speed, kp: Factor = 1.0, kd: Factor = 1.0, effort: Factor = 1.0):
     """PD, within the lines of both directions of voltage, within the effort."""
     wanted = kp * KP * offset.double().numpy() - kd * KD * speed.double().numpy()
     back = effort * STALL / SPEED * speed.double().numpy()
@@ -59,28 +61,28 @@ def test_below_the_line_the_torque_is_pd(built):
     np.testing.assert_allclose(law(offset, speed), np.clip(expected, -EFFORT, EFFORT))
     assert (np.abs(expected) < EFFORT).mean() > 0.8
     # the float32 of mjwarp: one part in 10^7 of the joint's angle and of the stall torque
-    np.testing.assert_allclose(torques(*built, offset, speed), law(offset, speed), rtol=1e-5, atol=3e-5)
+    np.testing.assert_allclose(torques(built, offset, speed), law(offset, speed), rtol=1e-5, atol=3e-5)
 
 
 @pytest.mark.parametrize("direction", [1.0, -1.0])
 @pytest.mark.parametrize(("share", "of_effort"), [(0.0, 1.0), (0.5, 1.0), (0.75, 0.5), (1.0, 0.0), (1.2, -0.4)])
 def test_drive_falls_with_speed_from_full_effort_at_half_to_zero(built, direction, share, of_effort):
     speed = direction * share * torch.as_tensor(SPEED, dtype=torch.float32).expand(WORLDS, 21)
-    given = torques(*built, torch.full((WORLDS, 21), 50.0 * direction), speed)
+    given = torques(built, torch.full((WORLDS, 21), 50.0 * direction), speed)
     np.testing.assert_allclose(given, np.tile(direction * of_effort * EFFORT, (WORLDS, 1)), atol=1e-4)
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 1.0, 1.2])
 def test_brakes_give_full_effort_at_any_speed(built, share):
     speed = share * torch.as_tensor(SPEED, dtype=torch.float32).expand(WORLDS, 21)
-    np.testing.assert_allclose(torques(*built, torch.full((WORLDS, 21), -50.0), speed), -np.tile(EFFORT, (WORLDS, 1)))
-    damped = torques(*built, torch.zeros(WORLDS, 21), speed)  # nothing but kd, up to the effort
+    np.testing.assert_allclose(torques(built, torch.full((WORLDS, 21), -50.0), speed), -np.tile(EFFORT, (WORLDS, 1)))
+    damped = torques(built, torch.zeros(WORLDS, 21), speed)  # nothing but kd, up to the effort
     np.testing.assert_allclose(damped, law(torch.zeros(WORLDS, 21), speed), atol=1e-4)
     np.testing.assert_allclose(damped, np.maximum(-KD * speed.numpy(), -EFFORT), atol=1e-4)
 
 
 def test_each_world_has_its_own_gains_and_stall_torque(built):
-    engine, model = built
+    engine, _ = built
     scales = {
         "kp": torch.linspace(0.8, 1.2, WORLDS),
         "kd": torch.linspace(1.3, 0.7, WORLDS),
@@ -95,7 +97,7 @@ def test_each_world_has_its_own_gains_and_stall_torque(built):
     for reach, share in regimes.values():
         offset = reach * (1.0 + 0.1 * torch.rand(WORLDS, 21, generator=generator))
         speed = share * torch.as_tensor(SPEED, dtype=torch.float32).expand(WORLDS, 21)
-        np.testing.assert_allclose(torques(engine, model, offset, speed), law(offset, speed, **columns), atol=2e-4)
+        np.testing.assert_allclose(torques(built, offset, speed), law(offset, speed, **columns), atol=2e-4)
     for name in scales:
         getattr(engine.params, f"{name}_scale").fill_(1.0)
     engine.apply_params(EVERY)
