@@ -1,5 +1,5 @@
 """``python -m pace.studies``: engines against each other, step sizes, solver settings, paddle reaction, motors,
-what a predictor can know, and whether a policy finds out its paddle (extra ``dev``).
+what a predictor can know, how a policy stands, and whether it finds out its paddle (extra ``dev``).
 
 Prints the tables of ``docs/engines.md``, ``docs/physics.md``, ``docs/predictor.md`` and ``docs/campaign.md`` and writes
 their figures.
@@ -14,7 +14,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
 
-from pace.studies import adaptation, motors, parity, predictor, reaction, steps
+from pace.studies import adaptation, motors, parity, posture, predictor, reaction, steps
 from pace.studies.swings import Swings, policy_swings, random_swings
 
 
@@ -64,6 +64,10 @@ def study_motors(options: argparse.Namespace) -> None:
     print(motors.table(motors.uses(_policies(options), options.worlds, options.serves)))
 
 
+def study_posture(options: argparse.Namespace) -> None:
+    print(posture.table(posture.postures(_policies(options), options.worlds, options.serves)))
+
+
 def study_adaptation(options: argparse.Namespace) -> None:
     found = adaptation.adaptations(_policies(options), options.worlds)
     print(adaptation.table(found))
@@ -91,6 +95,7 @@ STUDIES = {
     "solver": study_solver,
     "motors": study_motors,
     "predictor": study_predictor,
+    "posture": study_posture,
     "adaptation": study_adaptation,
 }
 
@@ -103,7 +108,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument(
         "--run", type=Path, help="run folder or checkpoint to study; none: random swings, or pretrained/*"
     )
-    parser.add_argument("--serves", type=int, default=128, help="motors, predictor: serves of each case")
+    parser.add_argument("--serves", type=int, default=128, help="motors, posture, predictor: serves of each case")
     parser.add_argument("--cases", nargs="*", choices=list(predictor.CASES), help="predictor: which; none: all")
     beside = "predictor: runs or checkpoints to measure beside the bounds"
     parser.add_argument("--predictors", nargs="*", type=Path, default=[], help=beside)
