@@ -91,10 +91,10 @@ class TableTennisEnv(EnvBase):
     def _build(self, predictor: Predictor | None) -> None:
         config, worlds, device = self.config, self.worlds, self.worlds.device
         reward = config.reward
-        self._serves = ServeSampler(config.serve, self.generator, device)
+        self._serves = ServeSampler(config.serve, self.num_worlds, self.generator, device)
         limits = (worlds.joint_lower, worlds.joint_upper)
         self._poses = PoseSampler(
-            config.reset, config.robot, worlds.nominal, limits, worlds.joint_names, self.generator
+            config.reset, config.robot, self.num_worlds, worlds.nominal, limits, worlds.joint_names, self.generator
         )
         self.game = Game(config, worlds.ball, worlds.robot.base_position)
         self.task_state = TaskState(worlds, self.game)
@@ -183,15 +183,14 @@ class TableTennisEnv(EnvBase):
     def reset_worlds(self, mask: Tensor) -> None:
         """Begin new episodes in the worlds of ``mask`` (N,) bool and refresh their observations; others keep theirs.
 
-        Samples are drawn for all worlds and kept by mask. On a CPU, where looking costs no wait, an empty mask returns
-        at once.
+        On a CPU, where looking costs no wait, an empty mask returns at once.
         """
         if self.worlds.device.type == "cpu" and not bool(mask.any()):
             return
         self._reset_in_place(mask)
 
     def _begin_episodes(self, mask: Tensor) -> None:
-        qpos, qvel = self._poses.sample(self.num_worlds)
+        qpos, qvel = self._poses.sample(mask)
         self.worlds.reset_robot(mask, qpos, qvel)
         self.game.clock.start_episode(mask, self.generator)
         self._start_serves(mask)
@@ -221,7 +220,7 @@ class TableTennisEnv(EnvBase):
 
     def _start_serves(self, mask: Tensor) -> None:
         ball = self.worlds.ball
-        self.worlds.serve(mask, *self._serves.sample(self.num_worlds))
+        self.worlds.serve(mask, *self._serves.sample(mask))
         ball.forecast(mask, ball.position, ball.velocity, ball.spin, self.config.reward.target_x)
         self.game.start_serve(mask)
 

@@ -323,6 +323,34 @@ def start_serve(
     game.something_to_hit[world] = _something_to_hit(game, position[world], velocity[world], rules, world)
 
 
+@wp.kernel
+def start_episode(
+    mask: wp.array[wp.bool],
+    seed: wp.array[wp.int32],
+    serves: int,
+    fresh: wp.array[wp.bool],
+    index: wp.array[wp.float32],
+):
+    """First serve of an episode, in the masked worlds: any of ``serves`` where the world is fresh."""
+    world = wp.tid()
+    if not mask[world]:
+        return
+    first = 0.0
+    if fresh[world] and serves > 0:
+        random = wp.rand_init(seed[0], world)
+        first = wp.min(wp.floor(wp.randf(random) * float(serves)), float(serves - 1))
+    index[world] = first
+    fresh[world] = False
+
+
+@wp.kernel
+def turn(yaw: wp.array[wp.float32], qpos: wp.array2d[wp.float32]):
+    """The quaternion of a robot that stands upright, turned by ``yaw`` rad."""
+    world = wp.tid()
+    qpos[world, 3] = wp.cos(0.5 * yaw[world])
+    qpos[world, 6] = wp.sin(0.5 * yaw[world])
+
+
 @wp.struct
 class DerivedArrays:
     """What rewards and the critic share: tensors of :class:`pace.rl.state.TaskState`."""

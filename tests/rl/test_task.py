@@ -285,8 +285,8 @@ def test_an_early_hit_is_an_arrival() -> None:
 
 
 def test_serves_are_drawn_in_range() -> None:
-    serve = config().serve
-    position, velocity, spin = ServeSampler(serve, torch.Generator().manual_seed(0), CPU).sample(4000)
+    serve, everyone = config().serve, torch.ones(4000, dtype=torch.bool)
+    position, velocity, spin = ServeSampler(serve, 4000, torch.Generator().manual_seed(0), CPU).sample(everyone)
     for value, low_high in zip(
         (*position.unbind(1), *velocity.unbind(1)),
         (serve.x, serve.y, serve.z, serve.vx, serve.vy, serve.vz),
@@ -304,7 +304,8 @@ def test_poses_are_drawn_in_range_and_within_joint_limits() -> None:
     nominal = torch.linspace(-0.6, 0.6, 21)
     limits = (torch.full((21,), -0.8), torch.full((21,), 0.8))
     generator = torch.Generator().manual_seed(0)
-    qpos, qvel = PoseSampler(task.reset, task.robot, nominal, limits, JOINT_NAMES, generator).sample(2000)
+    sampler = PoseSampler(task.reset, task.robot, 2000, nominal, limits, JOINT_NAMES, generator)
+    qpos, qvel = sampler.sample(torch.ones(2000, dtype=torch.bool))
     assert qpos.shape == (2000, 28)
     assert qvel.shape == (2000, 27)
     torch.testing.assert_close(qpos[:, 3:7].norm(dim=1), torch.ones(2000))
