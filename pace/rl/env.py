@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -98,6 +99,10 @@ class TableTennisEnv(EnvBase):
         )
         self.game = Game(config, worlds.ball, worlds.robot.base_position)
         self.task_state = TaskState(worlds, self.game)
+        ball, events = worlds.ball, worlds.ball.events
+        struck = (events.hit_position, events.hit_velocity_out, events.hit_spin_out)
+        self._forecast_return = ball.forecaster(*struck, reward.target_x)
+        self._forecast_serve = ball.forecaster(ball.position, ball.velocity, ball.spin, reward.target_x)
         self.rewards = RewardManager(reward, self.num_worlds, device, worlds.control_dt)
         self.sensing = Sensing(
             config.sensing, self.num_worlds, device, worlds.control_dt, worlds.nominal, self.generator
@@ -111,10 +116,10 @@ class TableTennisEnv(EnvBase):
     def _allocate(self) -> None:
         names, count, device = self.config.observation, self.num_worlds, self.worlds.device
         self.policy_layout, self.critic_layout = layout(names.policy, POLICY), layout(names.critic, CRITIC)
-        policy_size = sum(POLICY[name].size for name in names.policy)
-        critic_size = sum(CRITIC[name].size for name in names.critic)
-        self._policy_history = History(names.policy_history, policy_size, count, device)
-        self._critic_history = History(names.critic_history, critic_size, count, device)
+        policy = [partial(POLICY[name].function, self.actor) for name in names.policy]
+        critic = [partial(CRITIC[name].function, self.task_state) for name in names.critic]
+        self._policy_history = History(names.policy_history, policy)
+        self._critic_history = History(names.critic_history, critic)
         self.policy_observation = self._policy_history.observation
         self.critic_observation = self._critic_history.observation
         self.reward = self.rewards.reward
@@ -175,8 +180,8 @@ class TableTennisEnv(EnvBase):
         self._compute_signals()
         if self.actor.memory is not None:
             self.actor.memory.update()
-        self._policy_history.push(self._policy_signals())
-        self._critic_history.push(self._critic_signals())
+        self._policy_history.push()
+        self._critic_history.push()
         self._flag_bad()
 
     @torch.no_grad()
@@ -201,8 +206,8 @@ class TableTennisEnv(EnvBase):
         self._compute_signals(mask)
         if self.actor.memory is not None:
             self.actor.memory.restart(mask)
-        self._policy_history.fill(mask, self._policy_signals())
-        self._critic_history.fill(mask, self._critic_signals())
+        self._policy_history.fill(mask)
+        self._critic_history.fill(mask)
 
     def _move(self, action: Tensor) -> None:
         robot, state = self.config.robot, self.task_state
@@ -212,16 +217,13 @@ class TableTennisEnv(EnvBase):
 
     def _judge(self) -> None:
         """Referee, forecast of the returns, ends of serves and episodes."""
-        ball, events, game = self.worlds.ball, self.worlds.ball.events, self.game
-        game.judge()
-        struck = (events.hit_position, events.hit_velocity_out, events.hit_spin_out)
-        ball.forecast(game.referee.hit_now, *struck, self.config.reward.target_x)
-        game.close()
+        self.game.judge()
+        self._forecast_return(self.game.referee.hit_now)
+        self.game.close()
 
     def _start_serves(self, mask: Tensor) -> None:
-        ball = self.worlds.ball
         self.worlds.serve(mask, *self._serves.sample(mask))
-        ball.forecast(mask, ball.position, ball.velocity, ball.spin, self.config.reward.target_x)
+        self._forecast_serve(mask)
         self.game.start_serve(mask)
 
     def _compute_signals(self, changed: Tensor | None = None) -> None:
@@ -232,12 +234,6 @@ class TableTennisEnv(EnvBase):
         torch.sub(target.apex_time, now, out=self.predictor_time_to_apex)
         truth = {"apex": target.apex, "target": target.point, "target_time": (target.time - now).unsqueeze(-1)}
         torch.cat([truth[name] for name in self.config.predictor.outputs], dim=1, out=self.predictor_target)
-
-    def _policy_signals(self) -> list[Tensor]:
-        return [POLICY[name].function(self.actor) for name in self.config.observation.policy]
-
-    def _critic_signals(self) -> list[Tensor]:
-        return [CRITIC[name].function(self.task_state) for name in self.config.observation.critic]
 
     # --- faults, statistics, state ------------------------------------------------------------------------------------
 

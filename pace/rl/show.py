@@ -93,7 +93,9 @@ class ShowEnv(TableTennisEnv):
 
     def _build(self, predictor: Predictor | None) -> None:
         super()._build(predictor)
-        self._serves = self.chosen = ChosenServes(self.config.serve, self.num_worlds, self.generator, self.worlds.device)
+        self._serves = self.chosen = ChosenServes(
+            self.config.serve, self.num_worlds, self.generator, self.worlds.device
+        )
 
     def end_serve(self) -> None:
         """The present serve's time is up; the next one begins with the next control step."""

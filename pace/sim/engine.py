@@ -7,11 +7,14 @@ from typing import Protocol
 
 import mujoco
 import torch
+import warp as wp
 from torch import Tensor
 
 from pace.config import ConfigError, EngineConfig
+from pace.sim.engine_kernels import reset_state
 from pace.sim.graph import graphs_wanted
 from pace.sim.robot import FEET
+from pace.sim.sharing import record
 
 
 @dataclass(frozen=True)
@@ -116,6 +119,24 @@ class StateTensors:
         self.body_contact = torch.zeros(num_worlds, model.nsensordata - 3 * len(FEET), device=device)
         self.joint_torque = torch.zeros(num_worlds, model.nu, device=device)
         self.qpos_path.copy_(torch.as_tensor(model.key_qpos[0], dtype=torch.float32))
+        self._mask = torch.zeros(num_worlds, dtype=torch.bool, device=device)
+        self._start: tuple[Tensor | None, ...] = (None, None)
+
+    def _solver_state(self) -> tuple[Tensor, Tensor, Tensor]:
+        """qpos (N, 28), qvel (N, 27) and warm start (N, 27) of the engine itself, in its precision."""
+        raise NotImplementedError
+
+    def reset(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
+        """See :class:`RobotEngine`. Give the same tensors each time: others are bound anew, which takes longer."""
+        if self._start[0] is not qpos or self._start[1] is not qvel:
+            self._bind_start(qpos, qvel)
+        self._mask.copy_(mask)
+        self._reset()
+
+    def _bind_start(self, qpos: Tensor, qvel: Tensor) -> None:
+        self._start = (qpos, qvel)
+        tensors = (self._mask, qpos, qvel, *self._solver_state(), *self._outputs().values())
+        self._reset = record(reset_state, self.num_worlds, [wp.from_torch(t) for t in tensors], self.device)
 
     def _outputs(self) -> dict[str, Tensor]:
         names = ("qpos_path", "qvel_path", "foot_force", "body_contact", "joint_torque")

@@ -102,14 +102,8 @@ class MjwarpEngine(StateTensors):
         inputs = [self.data.qpos, self.data.qvel, instant, *self._warp_path]
         wp.launch(_record_state, dim=self.num_worlds, inputs=inputs)
 
-    def reset(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
-        wide = mask.unsqueeze(-1)
-        for state, path, values in ((self._qpos, self.qpos_path, qpos), (self._qvel, self.qvel_path, qvel)):
-            state.copy_(torch.where(wide, values, state))
-            path.copy_(torch.where(wide.unsqueeze(-1), values.unsqueeze(1), path))
-        for tensor in (self._warmstart, self.body_contact, self.joint_torque):
-            tensor.masked_fill_(wide, 0.0)
-        self.foot_force.masked_fill_(wide.unsqueeze(-1), 0.0)
+    def _solver_state(self) -> tuple[Tensor, Tensor, Tensor]:
+        return self._qpos, self._qvel, self._warmstart
 
     def apply_params(self, mask: Tensor) -> None:
         self._fields.write(mask)

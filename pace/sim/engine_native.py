@@ -62,16 +62,9 @@ class NativeEngine(StateTensors):
             path[:, 1:] = self._record[name]
         self._read_sensors(self._sensordata, self._actuator_force)
 
-    def reset(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
-        ids = mask.numpy().nonzero()[0]
-        states = (("qpos", self._qpos, qpos), ("qvel", self._qvel, qvel))
-        for name, state, values in states:
-            chosen = values.numpy()[ids]
-            state[ids] = chosen
-            self._paths[name][ids] = chosen[:, None]
-        self._warmstart[ids] = 0.0
-        for tensor in (self.foot_force, self.body_contact, self.joint_torque):
-            tensor.numpy()[ids] = 0.0
+    def _solver_state(self) -> tuple[Tensor, Tensor, Tensor]:
+        qpos, qvel, warmstart = (torch.from_numpy(array) for array in (self._qpos, self._qvel, self._warmstart))
+        return qpos, qvel, warmstart
 
     def apply_params(self, mask: Tensor) -> None:
         self._fields.write(mask)
