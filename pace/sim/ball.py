@@ -334,7 +334,7 @@ class BallSim:
         for own, given in zip(self._ask, (position, velocity, spin), strict=True):
             own.copy_(given)
         if self._ahead[0] != intercept_x:
-            self._ahead = (intercept_x, self.forecaster(*self._ask.unbind(), intercept_x))
+            self._ahead = (intercept_x, self.forecaster(self._ask[0], self._ask[1], self._ask[2], intercept_x))
         assert self._ahead[1] is not None
         self._ahead[1](mask)
 
