@@ -54,7 +54,9 @@ class TaskState:
     ``something_to_hit`` (N,) bool; ``apex``, ``target`` (N, 3) m, the point to stand by where there is nothing to hit;
     ``arrival`` (N,) s until the ball is at the target, 0 where there is nothing to hit; ``base_error``, ``shift``
     (N, 2) m from the base to where it should stand, for the rewards and as the networks see it; ``foot_load``
-    (N, 2) N, ``foot_contact`` (N, 2) bool, ``feet_distance`` (N,) m.
+    (N, 2) N, ``foot_contact`` (N, 2) bool, ``feet_distance`` (N,) m; ``paddle_to_target`` (N, 3) m; ``joint_offset``
+    (N, J) rad from the nominal pose; ``serve_progress`` (N,), share of the longest serve, and ``episode_progress``
+    (N,), share of the episode's serves, 0 where episodes do not end.
     """
 
     def __init__(self, worlds: Worlds, game: Game) -> None:
@@ -78,10 +80,14 @@ class TaskState:
         self.foot_load = torch.zeros(count, 2, device=device)
         self.foot_contact = torch.zeros(count, 2, dtype=torch.bool, device=device)
         self.feet_distance = torch.zeros(count, device=device)
+        shown = torch.zeros(count, 5 + self.action.shape[1], device=device)  # to the critic; not part of the state
+        self.paddle_to_target, self.joint_offset = shown[:, :3], shown[:, 5:]
+        self.serve_progress, self.episode_progress = shown[:, 3], shown[:, 4]
 
     def _record(self, worlds: Worlds) -> None:
         ball, robot = self.ball, self.robot
-        seen = (ball.position, ball.velocity, robot.base_position, robot.foot_force, robot.foot_position)
+        seen = (ball.position, ball.velocity, robot.base_position, robot.paddle_position)
+        seen += (robot.joint_position, self.nominal, robot.foot_force, robot.foot_position)
         derived = share_all(DerivedArrays, vars(self))
         inputs = [self.game.arrays(), derived, *(share(tensor) for tensor in seen), self.game.rules]
         self._derive = record(derive, worlds.num_worlds, inputs, worlds.device)

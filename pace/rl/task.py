@@ -211,18 +211,6 @@ class ServeClock(Part):
         self.index += over
         self.played += over
 
-    @property
-    def serve_progress(self) -> Tensor:
-        """Share of the longest serve (N,)."""
-        return self.time / self._config.max_duration
-
-    @property
-    def episode_progress(self) -> Tensor:
-        """Share of the episode's serves (N,), 0 where episodes do not end."""
-        if self._config.serves_per_episode == 0:
-            return torch.zeros_like(self.time)
-        return ((self.index + self.serve_progress) / self._config.serves_per_episode).clamp(max=1.0)
-
 
 class StepEnds(Part):
     """What ended in the last control step.

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import torch
 
+from pace.rl.state import TaskState
 from pace.rl.task import Outcome, PoseSampler, ServeSampler
 from tests.rl.fakes import CPU, JOINT_NAMES, config, fake_game, set_events
 
@@ -360,7 +361,10 @@ def test_episodes_count_five_serves_and_first_ones_start_anywhere() -> None:
     assert not clock.index.any()
     clock.finish(everyone)
     clock.time.fill_(0.9)
-    assert float(clock.episode_progress[0]) == pytest.approx(1.5 / 5)
+    state = TaskState(worlds, game)
+    state.derive()
+    assert float(state.serve_progress[0]) == pytest.approx(0.5)
+    assert float(state.episode_progress[0]) == pytest.approx(1.5 / 5)
 
 
 def test_endless_play_has_no_last_serve() -> None:
@@ -372,7 +376,9 @@ def test_endless_play_has_no_last_serve() -> None:
     game.close()
     assert game.ends.over.all()
     assert not game.ends.truncated.any()
-    assert not game.clock.episode_progress.any()
+    state = TaskState(worlds, game)
+    state.derive()
+    assert not state.episode_progress.any()
 
 
 def test_lost_positions() -> None:
