@@ -111,7 +111,6 @@ class TableTennisEnv(EnvBase):
         signals = (self.sensing, worlds.kinematics, worlds.nominal, action)
         memory = config.observation.return_memory
         self.actor = ActorSignals(*signals, predictor, config.predictor, rule, rules, memory)
-        self.statistics = Statistics(self.num_worlds, device)
 
     def _allocate(self) -> None:
         names, count, device = self.config.observation, self.num_worlds, self.worlds.device
@@ -133,6 +132,7 @@ class TableTennisEnv(EnvBase):
         self.serve_over, self.serve_outcome, self.serve_hit = ends.over, ends.outcome, ends.hit
         self._bad = torch.zeros_like(self._everyone)
         self.first_counted_serve, self._warmup_serves = torch.zeros((), device=device), 0
+        self.statistics = Statistics(self.game, self.first_counted_serve)
 
     def _capture(self) -> None:
         device = self.worlds.device
@@ -172,7 +172,7 @@ class TableTennisEnv(EnvBase):
         self.task_state.refresh()
         self.rewards.compute(self.task_state)
         next_serve = self.game.ends.next_serve
-        self.statistics.add(self)
+        self.statistics.add()
         self.game.clock.finish(self.serve_over)
         self._start_serves(next_serve)
         self.sensing.update(self.worlds.robot, self.worlds.ball.position, next_serve)
