@@ -6,12 +6,14 @@ Draws are made where a mask says so, on the device (:mod:`pace.sim.draws`), so t
 from __future__ import annotations
 
 import torch
+import warp as wp
 from torch import Tensor
 
 from pace.config import BallConfig, ConfigError, RandomizationConfig
 from pace.sim.ball import BallParams
 from pace.sim.draws import Column, Draws
 from pace.sim.engine import EngineParams
+from pace.sim.sharing import record, share
 
 #: Engine parameters that are drawn straight from the range of the same name.
 ENGINE_DRAWS = ("friction", "trunk_mass", "trunk_com", "kp_scale", "kd_scale", "armature_scale", "effort_scale")
@@ -27,6 +29,29 @@ BALL_DRAWS = {
 }
 #: Restitution above one would create energy; friction below zero would too.
 BALL_LIMITS = {"table_restitution": (0.0, 1.0), "paddle_restitution": (0.0, 1.0)}
+
+
+@wp.kernel
+def _push(
+    seed: wp.array[wp.int32],
+    control_dt: float,
+    interval: wp.vec2,
+    velocity: wp.vec2,
+    until_push: wp.array[wp.float32],
+    push: wp.array2d[wp.float32],
+):
+    """One world's time to its next push, s, and the push (x, y) that is due, m/s; zero where none is."""
+    world = wp.tid()
+    left = until_push[world] - control_dt
+    x, y = 0.0, 0.0
+    if left < 0.0:
+        random = wp.rand_init(seed[0], world)
+        left = interval[0] + wp.randf(random) * (interval[1] - interval[0])
+        x = velocity[0] + wp.randf(random) * (velocity[1] - velocity[0])
+        y = velocity[0] + wp.randf(random) * (velocity[1] - velocity[0])
+    until_push[world] = left
+    push[world, 0] = x
+    push[world, 1] = y
 
 
 class Randomizer:
@@ -51,7 +76,6 @@ class Randomizer:
         self._ball_params = ball_params
         self._nominal_ball = {name: float(getattr(ball, name)) for name in BALL_DRAWS}
         self._generator = generator
-        self._control_dt = control_dt
         if not 0.0 <= config.actuator_delay[0] <= config.actuator_delay[1] <= control_dt:
             raise ConfigError(f"randomization.actuator_delay must lie within one control step (0 to {control_dt} s)")
         num_worlds, device = engine_params.friction.shape[0], engine_params.friction.device
@@ -60,7 +84,10 @@ class Randomizer:
         self.pushes_enabled = config.push_interval[1] > 0.0
         self._until_push = torch.zeros(num_worlds, device=device)
         self._draw = Draws(self._columns(), generator)
-        self._push_low, self._push_width = _bounds([config.push_interval, *[config.push_velocity] * 2], device)
+        self._seed = torch.zeros(1, dtype=torch.int32, device=device)
+        ranges = [wp.vec2(*config.push_interval), wp.vec2(*config.push_velocity)]
+        state = [share(self._until_push), wp.from_torch(self.push)]
+        self._advance_push = record(_push, num_worlds, [share(self._seed), control_dt, *ranges, *state], device)
         self.draw(torch.ones(num_worlds, dtype=torch.bool, device=device))
 
     def _columns(self) -> list[Column]:
@@ -84,12 +111,8 @@ class Randomizer:
 
     def update_push(self) -> Tensor:
         """Advance the push timers by one control step; return ``push`` (N, nv), zero where no push is due."""
-        self._until_push -= self._control_dt
-        due = self._until_push < 0.0
-        sample = torch.rand(due.shape[0], 3, device=due.device, generator=self._generator)
-        sample.mul_(self._push_width).add_(self._push_low)
-        torch.where(due, sample[:, 0], self._until_push, out=self._until_push)
-        torch.mul(sample[:, 1:], due.unsqueeze(-1), out=self.push[:, :2])
+        self._seed.random_(generator=self._generator)
+        self._advance_push()
         return self.push
 
     def state_dict(self) -> dict[str, Tensor]:
@@ -102,9 +125,3 @@ class Randomizer:
         """Put back what :meth:`state_dict` returned; shapes must match."""
         for name, tensor in self.state_dict().items():
             tensor.copy_(state[name])
-
-
-def _bounds(ranges: list[list[float]], device: torch.device) -> tuple[Tensor, Tensor]:
-    """Lower ends and widths (C,) of C ranges."""
-    low, high = torch.tensor(ranges, dtype=torch.float32, device=device).unbind(1)
-    return low.contiguous(), high - low
