@@ -70,7 +70,7 @@ class ServePractice:
             config.engine.ball_dt,
         )
         self._randomizer = self._make_randomizer()
-        self._serves = ServeSampler(config.serve, self.generator, device)
+        self._serves = ServeSampler(config.serve, count, self.generator, device)
         self._game = Game(config, self.ball, torch.tensor(STANDING, device=device).repeat(count, 1))
         self._track = BallTrack(config.predictor.frames, config.reward.nothing_to_hit, count, device)
         self._path = torch.full((count, 2, 12), FAR_AWAY, device=device)
@@ -111,7 +111,7 @@ class ServePractice:
     def _serve(self, mask: Tensor) -> None:
         ball, wide = self.ball, mask.unsqueeze(-1)
         self._randomizer.draw(mask)
-        launch = self._serves.sample(self.config.num_worlds)
+        launch = self._serves.sample(mask)
         for value, start in zip((ball.position, ball.velocity, ball.spin), launch, strict=True):
             value.copy_(torch.where(wide, start, value))
         ball.forecast(mask, ball.position, ball.velocity, ball.spin, self.config.reward.target_x)

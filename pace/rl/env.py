@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -91,13 +92,17 @@ class TableTennisEnv(EnvBase):
     def _build(self, predictor: Predictor | None) -> None:
         config, worlds, device = self.config, self.worlds, self.worlds.device
         reward = config.reward
-        self._serves = ServeSampler(config.serve, self.generator, device)
+        self._serves = ServeSampler(config.serve, self.num_worlds, self.generator, device)
         limits = (worlds.joint_lower, worlds.joint_upper)
         self._poses = PoseSampler(
-            config.reset, config.robot, worlds.nominal, limits, worlds.joint_names, self.generator
+            config.reset, config.robot, self.num_worlds, worlds.nominal, limits, worlds.joint_names, self.generator
         )
         self.game = Game(config, worlds.ball, worlds.robot.base_position)
         self.task_state = TaskState(worlds, self.game)
+        ball, events = worlds.ball, worlds.ball.events
+        struck = (events.hit_position, events.hit_velocity_out, events.hit_spin_out)
+        self._forecast_return = ball.forecaster(*struck, reward.target_x)
+        self._forecast_serve = ball.forecaster(ball.position, ball.velocity, ball.spin, reward.target_x)
         self.rewards = RewardManager(reward, self.num_worlds, device, worlds.control_dt)
         self.sensing = Sensing(
             config.sensing, self.num_worlds, device, worlds.control_dt, worlds.nominal, self.generator
@@ -106,15 +111,14 @@ class TableTennisEnv(EnvBase):
         signals = (self.sensing, worlds.kinematics, worlds.nominal, action)
         memory = config.observation.return_memory
         self.actor = ActorSignals(*signals, predictor, config.predictor, rule, rules, memory)
-        self.statistics = Statistics(self.num_worlds, device)
 
     def _allocate(self) -> None:
         names, count, device = self.config.observation, self.num_worlds, self.worlds.device
         self.policy_layout, self.critic_layout = layout(names.policy, POLICY), layout(names.critic, CRITIC)
-        policy_size = sum(POLICY[name].size for name in names.policy)
-        critic_size = sum(CRITIC[name].size for name in names.critic)
-        self._policy_history = History(names.policy_history, policy_size, count, device)
-        self._critic_history = History(names.critic_history, critic_size, count, device)
+        policy = [partial(POLICY[name].function, self.actor) for name in names.policy]
+        critic = [partial(CRITIC[name].function, self.task_state) for name in names.critic]
+        self._policy_history = History(names.policy_history, policy)
+        self._critic_history = History(names.critic_history, critic)
         self.policy_observation = self._policy_history.observation
         self.critic_observation = self._critic_history.observation
         self.reward = self.rewards.reward
@@ -128,6 +132,7 @@ class TableTennisEnv(EnvBase):
         self.serve_over, self.serve_outcome, self.serve_hit = ends.over, ends.outcome, ends.hit
         self._bad = torch.zeros_like(self._everyone)
         self.first_counted_serve, self._warmup_serves = torch.zeros((), device=device), 0
+        self.statistics = Statistics(self.game, self.first_counted_serve)
 
     def _capture(self) -> None:
         device = self.worlds.device
@@ -167,7 +172,7 @@ class TableTennisEnv(EnvBase):
         self.task_state.refresh()
         self.rewards.compute(self.task_state)
         next_serve = self.game.ends.next_serve
-        self.statistics.add(self)
+        self.statistics.add()
         self.game.clock.finish(self.serve_over)
         self._start_serves(next_serve)
         self.sensing.update(self.worlds.robot, self.worlds.ball.position, next_serve)
@@ -175,23 +180,22 @@ class TableTennisEnv(EnvBase):
         self._compute_signals()
         if self.actor.memory is not None:
             self.actor.memory.update()
-        self._policy_history.push(self._policy_signals())
-        self._critic_history.push(self._critic_signals())
+        self._policy_history.push()
+        self._critic_history.push()
         self._flag_bad()
 
     @torch.no_grad()
     def reset_worlds(self, mask: Tensor) -> None:
         """Begin new episodes in the worlds of ``mask`` (N,) bool and refresh their observations; others keep theirs.
 
-        Samples are drawn for all worlds and kept by mask. On a CPU, where looking costs no wait, an empty mask returns
-        at once.
+        On a CPU, where looking costs no wait, an empty mask returns at once.
         """
         if self.worlds.device.type == "cpu" and not bool(mask.any()):
             return
         self._reset_in_place(mask)
 
     def _begin_episodes(self, mask: Tensor) -> None:
-        qpos, qvel = self._poses.sample(self.num_worlds)
+        qpos, qvel = self._poses.sample(mask)
         self.worlds.reset_robot(mask, qpos, qvel)
         self.game.clock.start_episode(mask, self.generator)
         self._start_serves(mask)
@@ -202,8 +206,8 @@ class TableTennisEnv(EnvBase):
         self._compute_signals(mask)
         if self.actor.memory is not None:
             self.actor.memory.restart(mask)
-        self._policy_history.fill(mask, self._policy_signals())
-        self._critic_history.fill(mask, self._critic_signals())
+        self._policy_history.fill(mask)
+        self._critic_history.fill(mask)
 
     def _move(self, action: Tensor) -> None:
         robot, state = self.config.robot, self.task_state
@@ -213,16 +217,13 @@ class TableTennisEnv(EnvBase):
 
     def _judge(self) -> None:
         """Referee, forecast of the returns, ends of serves and episodes."""
-        ball, events, game = self.worlds.ball, self.worlds.ball.events, self.game
-        game.judge()
-        struck = (events.hit_position, events.hit_velocity_out, events.hit_spin_out)
-        ball.forecast(game.referee.hit_now, *struck, self.config.reward.target_x)
-        game.close()
+        self.game.judge()
+        self._forecast_return(self.game.referee.hit_now)
+        self.game.close()
 
     def _start_serves(self, mask: Tensor) -> None:
-        ball = self.worlds.ball
-        self.worlds.serve(mask, *self._serves.sample(self.num_worlds))
-        ball.forecast(mask, ball.position, ball.velocity, ball.spin, self.config.reward.target_x)
+        self.worlds.serve(mask, *self._serves.sample(mask))
+        self._forecast_serve(mask)
         self.game.start_serve(mask)
 
     def _compute_signals(self, changed: Tensor | None = None) -> None:
@@ -233,12 +234,6 @@ class TableTennisEnv(EnvBase):
         torch.sub(target.apex_time, now, out=self.predictor_time_to_apex)
         truth = {"apex": target.apex, "target": target.point, "target_time": (target.time - now).unsqueeze(-1)}
         torch.cat([truth[name] for name in self.config.predictor.outputs], dim=1, out=self.predictor_target)
-
-    def _policy_signals(self) -> list[Tensor]:
-        return [POLICY[name].function(self.actor) for name in self.config.observation.policy]
-
-    def _critic_signals(self) -> list[Tensor]:
-        return [CRITIC[name].function(self.task_state) for name in self.config.observation.critic]
 
     # --- faults, statistics, state ------------------------------------------------------------------------------------
 

@@ -10,7 +10,7 @@ the current one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple, Protocol
 
 import torch
@@ -20,7 +20,7 @@ from torch import Tensor
 from pace.config import ConfigError, ObservationConfig, PredictorConfig, ReturnMemoryConfig
 from pace.predictor.network import OUTPUT_SIZES, predictor_slices
 from pace.rl.memory import SEEN, ReturnMemory
-from pace.rl.signal_kernels import PredictionLayout, fill_frames, follow_ball, read_prediction
+from pace.rl.signal_kernels import PredictionLayout, SignalArrays, fill_frames, follow_ball, read_prediction
 from pace.rl.state import TaskState
 from pace.rl.task_kernels import Rules
 from pace.sim.sensing import Sensing
@@ -32,8 +32,10 @@ JOINTS = 21
 class PaddlePose(Protocol):
     """Forward kinematics (:class:`pace.sim.kinematics.Kinematics`)."""
 
-    def paddle_pose(self, base_position: Tensor, base_quat: Tensor, joint_position: Tensor) -> tuple[Tensor, Tensor]:
-        """Centre (N, 3) m and unit normal (N, 3) of the paddle, world frame."""
+    def paddle_pose(
+        self, base_position: Tensor, base_quat: Tensor, joint_position: Tensor, mask: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Centre (N, 3) m and unit normal (N, 3) of the paddle, world frame; ``mask``: the worlds that are new."""
         ...
 
 
@@ -157,7 +159,7 @@ class ActorSignals:
         """
         sensing = self.sensing
         torch.add(sensing.joint_position, self._nominal, out=self._joints)
-        centre, normal = self._kinematics.paddle_pose(sensing.base_position, sensing.base_quat, self._joints)
+        centre, normal = self._kinematics.paddle_pose(sensing.base_position, sensing.base_quat, self._joints, changed)
         self.paddle_position.copy_(centre)
         self.paddle_normal.copy_(normal)
         if self.predictor is not None:
@@ -193,7 +195,7 @@ def _last_return(signals: ActorSignals) -> Tensor:
 
 
 def _column(values: Tensor) -> Tensor:
-    return values.unsqueeze(-1).float()
+    return values.unsqueeze(-1)
 
 
 #: What the actor can see: sensed, delayed, noisy signals, and what is computed from them.
@@ -220,7 +222,7 @@ CRITIC: dict[str, CriticObservation] = {
     "base_angular_velocity": CriticObservation(3, lambda s: s.robot.base_angular_velocity),
     "base_position": CriticObservation(3, lambda s: s.robot.base_position),
     "projected_gravity": CriticObservation(3, lambda s: s.robot.projected_gravity),
-    "joint_position": CriticObservation(JOINTS, lambda s: s.robot.joint_position - s.nominal),
+    "joint_position": CriticObservation(JOINTS, lambda s: s.joint_offset),
     "joint_velocity": CriticObservation(JOINTS, lambda s: s.robot.joint_velocity),
     "previous_action": CriticObservation(JOINTS, lambda s: s.action),
     "ball_position": CriticObservation(3, lambda s: s.ball.position),
@@ -230,13 +232,13 @@ CRITIC: dict[str, CriticObservation] = {
     "ball_velocity": CriticObservation(3, lambda s: s.ball.velocity),
     "paddle_position": CriticObservation(3, lambda s: s.robot.paddle_position),
     "time_to_arrival": CriticObservation(1, lambda s: _column(s.arrival)),
-    "serve_progress": CriticObservation(1, lambda s: _column(s.game.clock.serve_progress)),
-    "episode_progress": CriticObservation(1, lambda s: _column(s.game.clock.episode_progress)),
+    "serve_progress": CriticObservation(1, lambda s: _column(s.serve_progress)),
+    "episode_progress": CriticObservation(1, lambda s: _column(s.episode_progress)),
     "own_bounce": CriticObservation(1, lambda s: _column(s.game.referee.own_bounces > 0)),
     "paddle_touched": CriticObservation(1, lambda s: _column(s.game.referee.touched)),
     "base_linear_velocity": CriticObservation(3, lambda s: s.robot.base_linear_velocity),
-    "foot_contact": CriticObservation(2, lambda s: s.foot_contact.float()),
-    "paddle_to_target": CriticObservation(3, lambda s: s.target - s.robot.paddle_position),
+    "foot_contact": CriticObservation(2, lambda s: s.foot_contact),
+    "paddle_to_target": CriticObservation(3, lambda s: s.paddle_to_target),
     "paddle_velocity": CriticObservation(3, lambda s: s.robot.paddle_velocity),
     "paddle_normal": CriticObservation(3, lambda s: s.robot.paddle_normal),
     # of each world: the restitution is that at speed zero
@@ -283,30 +285,73 @@ def layout(names: list[str], table: Table) -> dict[str, slice]:
     return columns
 
 
+class Signals:
+    """Observations that are side by side in a frame.
+
+    A signal that lies where it lay before is read there; another one, which its function computes, is kept in a tensor
+    of its own. Which of them it is, is seen at the start, so a function must do the same each time.
+
+    Attributes: ``tensors``, (N, size) float32 each, with the values of the last :meth:`compute`.
+
+    Args: functions: each returns a signal (N, size), float32 or bool.
+    """
+
+    def __init__(self, functions: Sequence[Callable[[], Tensor]]) -> None:
+        self.tensors: list[Tensor] = []
+        self._computed: list[tuple[Callable[[], Tensor], Tensor]] = []
+        for function in functions:
+            signal, again = function(), function()  # both at once, or the second could lie where the first was
+            if signal.data_ptr() != again.data_ptr() or signal.dtype != torch.float32:
+                signal = signal.float()
+                self._computed.append((function, signal))
+            self.tensors.append(signal)
+
+    def compute(self) -> None:
+        """Bring all of them up to date."""
+        for function, signal in self._computed:
+            signal.copy_(function())
+
+    def arrays(self) -> wp.array:
+        """Where they are, for kernels."""
+        arrays, start = [], 0
+        for tensor in self.tensors:
+            signal = SignalArrays()
+            signal.values, signal.start = wp.from_torch(tensor), start
+            arrays.append(signal)
+            start += tensor.shape[1]
+        return wp.array(arrays, dtype=SignalArrays, device=wp.device_from_torch(self.tensors[0].device))
+
+
 class History:
     """The last H frames of N worlds.
 
     Attributes: ``frame`` (N, D) the newest, ``observation`` (N, H * D) all of them, oldest first, ``frames``
     (N, H, D) the same.
+
+    Args: frames: H; functions: of the signals that make a frame, as :class:`Signals` wants them.
     """
 
-    def __init__(self, frames: int, size: int, num_worlds: int, device: torch.device) -> None:
-        self.frame = torch.zeros(num_worlds, size, device=device)
-        self.observation = torch.zeros(num_worlds, frames * size, device=device)
-        self.frames = self.observation.view(num_worlds, frames, size)
-        self._mask = torch.zeros(num_worlds, dtype=torch.bool, device=device)
-        arrays = [wp.from_torch(tensor) for tensor in (self._mask, self.frame, self.observation)]
-        self._fill = record(fill_frames, num_worlds, arrays, device)
+    def __init__(self, frames: int, functions: Sequence[Callable[[], Tensor]]) -> None:
+        self._signals = Signals(functions)
+        tensors = self._signals.tensors
+        size, count, device = sum(tensor.shape[1] for tensor in tensors), len(tensors[0]), tensors[0].device
+        self.frame = torch.zeros(count, size, device=device)
+        self.observation = torch.zeros(count, frames * size, device=device)
+        self.frames = self.observation.view(count, frames, size)
+        self._mask = torch.zeros(count, dtype=torch.bool, device=device)
+        own = [wp.from_torch(tensor) for tensor in (self.frame, self.observation)]
+        self._fill = record(fill_frames, count, [share(self._mask), self._signals.arrays(), *own], device)
 
-    def push(self, signals: list[Tensor]) -> None:
-        """Append a frame made of ``signals``, each (N, size)."""
-        torch.cat(signals, dim=1, out=self.frame)
+    def push(self) -> None:
+        """Append a frame made of the present signals."""
+        self._signals.compute()
+        torch.cat(self._signals.tensors, dim=1, out=self.frame)
         for older in range(self.frames.shape[1] - 1):  # twice as fast as a kernel, which Warp does not vectorise
             self.frames[:, older].copy_(self.frames[:, older + 1])
         self.frames[:, -1].copy_(self.frame)
 
-    def fill(self, mask: Tensor, signals: list[Tensor]) -> None:
-        """Set all frames of the worlds of ``mask`` (N,) bool to the current one."""
-        torch.cat(signals, dim=1, out=self.frame)
+    def fill(self, mask: Tensor) -> None:
+        """Set all frames of the worlds of ``mask`` (N,) bool to one made of the present signals."""
+        self._signals.compute()
         self._mask.copy_(mask)
         self._fill()

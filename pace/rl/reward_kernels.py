@@ -16,6 +16,10 @@ class RobotArrays:
     foot_up: wp.array2d[wp.vec3]
     paddle_position: wp.array[wp.vec3]
     head_position: wp.array[wp.vec3]
+    base_linear_velocity: wp.array[wp.vec3]
+    base_angular_velocity: wp.array[wp.vec3]
+    projected_gravity: wp.array[wp.vec3]
+    body_contact: wp.array2d[wp.float32]
     action: wp.array2d[wp.float32]
     previous_action: wp.array2d[wp.float32]
 
@@ -46,6 +50,14 @@ class Measures:
     foot_slide: wp.array[wp.float32]
     foot_steepness: wp.array[wp.float32]
     paddle_to_head: wp.array[wp.float32]
+    paddle_to_target: wp.array[wp.float32]
+    base_to_target: wp.array[wp.float32]
+    vertical_velocity: wp.array[wp.float32]
+    roll_pitch_rate: wp.array[wp.float32]
+    yaw_rate: wp.array[wp.float32]
+    base_tilt: wp.array[wp.float32]
+    contacts: wp.array[wp.float32]
+    feet_down: wp.array[wp.float32]
 
 
 @wp.func
@@ -87,21 +99,49 @@ def _measure_feet(robot: RobotArrays, contact: wp.array2d[wp.bool], measures: Me
     tilt = wp.float32(0.0)
     slide = wp.float32(0.0)
     steepness = wp.float32(0.0)
+    down = wp.float32(0.0)
     for foot in range(2):
         tilt += wp.length_sq(_horizontal(robot.foot_up[world, foot]))
         if contact[world, foot]:
+            down += 1.0
             force = robot.foot_force[world, foot]
             slide += wp.length(_horizontal(robot.foot_velocity[world, foot]))
             steepness = wp.max(steepness, wp.length(_horizontal(force)) / wp.abs(force[2]))
     measures.foot_tilt[world] = tilt
     measures.foot_slide[world] = slide
     measures.foot_steepness[world] = steepness
+    measures.feet_down[world] = down
+
+
+@wp.func
+def _measure_base(robot: RobotArrays, measures: Measures, world: int):
+    velocity, rate = robot.base_linear_velocity[world], robot.base_angular_velocity[world]
+    measures.vertical_velocity[world] = velocity[2] * velocity[2]
+    measures.roll_pitch_rate[world] = wp.length_sq(_horizontal(rate))
+    measures.yaw_rate[world] = rate[2] * rate[2]
+    measures.base_tilt[world] = wp.length_sq(_horizontal(robot.projected_gravity[world]))
+    contacts = wp.float32(0.0)
+    for body in range(robot.body_contact.shape[1]):
+        contacts += robot.body_contact[world, body]
+    measures.contacts[world] = contacts
 
 
 @wp.kernel
-def measure(robot: RobotArrays, joints: JointArrays, foot_contact: wp.array2d[wp.bool], measures: Measures):
-    """Sums over the joints and feet of one world."""
+def measure(
+    robot: RobotArrays,
+    joints: JointArrays,
+    foot_contact: wp.array2d[wp.bool],
+    point: wp.array[wp.vec3],
+    base_error: wp.array[wp.vec2],
+    measures: Measures,
+):
+    """Sums over the joints and feet of one world, its base's motion, and how far paddle and base are from where they
+    should be."""
     world = wp.tid()
     _measure_joints(robot, joints, measures, world)
     _measure_feet(robot, foot_contact, measures, world)
-    measures.paddle_to_head[world] = wp.length(robot.paddle_position[world] - robot.head_position[world])
+    _measure_base(robot, measures, world)
+    paddle = robot.paddle_position[world]
+    measures.paddle_to_head[world] = wp.length(paddle - robot.head_position[world])
+    measures.paddle_to_target[world] = wp.length(paddle - point[world])
+    measures.base_to_target[world] = wp.length(base_error[world])

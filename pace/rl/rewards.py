@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import NamedTuple
 
 import torch
@@ -46,6 +47,12 @@ def _length(vector: Tensor) -> Tensor:
     return torch.linalg.vector_norm(vector, dim=-1)
 
 
+@cache
+def _constant(numbers: tuple[float, ...], device: torch.device) -> Tensor:
+    """Numbers on the device; made once, for a step must bring nothing there."""
+    return torch.tensor(numbers, device=device)
+
+
 def _kernel(error: Tensor, params: Params) -> Tensor:
     """exp(-max(error, tolerance) / sigma^2): flat near the goal."""
     return error.clamp(min=params["tolerance"]).mul_(-1.0 / params["sigma"] ** 2).exp_()
@@ -57,14 +64,13 @@ def _kernel(error: Tensor, params: Params) -> Tensor:
 @term("tolerance", "sigma")
 def paddle_to_target(state: TaskState, params: Params) -> Tensor:
     """Nearness of the paddle to its target while there is something to hit; distances in m."""
-    distance = _length(state.robot.paddle_position - state.game.target.point)
-    return _kernel(distance, params) * state.something_to_hit
+    return _kernel(state.measures["paddle_to_target"], params) * state.something_to_hit
 
 
 @term("tolerance", "sigma")
 def base_to_target(state: TaskState, params: Params) -> Tensor:
     """Nearness of the base to its target on the ground, m; the idle position while there is nothing to hit."""
-    return _kernel(_length(state.base_error), params)
+    return _kernel(state.measures["base_to_target"], params)
 
 
 @term("gain", "limit", "tolerance", "sigma")
@@ -125,11 +131,10 @@ def return_velocity(state: TaskState, params: Params) -> Tensor:
     this term leads across.
     """
     events = state.ball.events
-    lifted = params["z"] + 0.5 * GRAVITY * params["time"] ** 2
-    error = events.hit_velocity_out + events.hit_position / params["time"]
-    for axis, aim in enumerate((params["x"], params["y"], lifted)):
-        error[:, axis] -= aim / params["time"]
-    return (1.0 - _length(error) / params["reach"]).clamp(min=0.0) * state.game.referee.hit_now
+    time, lifted = params["time"], params["z"] + 0.5 * GRAVITY * params["time"] ** 2
+    aim = _constant((params["x"] / time, params["y"] / time, lifted / time), events.hit_position.device)
+    error = torch.add(events.hit_velocity_out, events.hit_position, alpha=1.0 / time).sub_(aim)
+    return (1.0 - _length(error) / params["reach"]).clamp_(min=0.0) * state.game.referee.hit_now
 
 
 @term("at_hit")
@@ -143,7 +148,7 @@ def success(state: TaskState, params: Params) -> Tensor:
 @term()
 def unstable_hit(state: TaskState, params: Params) -> Tensor:
     """At the hit, without both feet down."""
-    return (state.game.referee.hit_now & ~state.foot_contact.all(1)).float()
+    return (state.game.referee.hit_now & (state.measures["feet_down"] < 2.0)).float()
 
 
 # --- posture and motion of the base -----------------------------------------------------------------------------------
@@ -152,25 +157,25 @@ def unstable_hit(state: TaskState, params: Params) -> Tensor:
 @term()
 def base_vertical_velocity(state: TaskState, params: Params) -> Tensor:
     """Squared, (m/s)^2."""
-    return state.robot.base_linear_velocity[:, 2].square()
+    return state.measures["vertical_velocity"]
 
 
 @term()
 def base_roll_pitch_rate(state: TaskState, params: Params) -> Tensor:
     """Squared, (rad/s)^2."""
-    return state.robot.base_angular_velocity[:, :2].square().sum(1)
+    return state.measures["roll_pitch_rate"]
 
 
 @term()
 def base_yaw_rate(state: TaskState, params: Params) -> Tensor:
     """Squared, (rad/s)^2."""
-    return state.robot.base_angular_velocity[:, 2].square()
+    return state.measures["yaw_rate"]
 
 
 @term()
 def base_tilt(state: TaskState, params: Params) -> Tensor:
     """Squared horizontal part of gravity in the body frame."""
-    return state.robot.projected_gravity[:, :2].square().sum(1)
+    return state.measures["base_tilt"]
 
 
 @term("x", "margin", "sigma")
@@ -189,7 +194,7 @@ def fall(state: TaskState, params: Params) -> Tensor:
 @term()
 def undesired_contact(state: TaskState, params: Params) -> Tensor:
     """Number of bodies other than the feet that touch something."""
-    return state.robot.body_contact.sum(1)
+    return state.measures["contacts"]
 
 
 @term("distance")
@@ -228,9 +233,8 @@ def action_rate(state: TaskState, params: Params) -> Tensor:
 @term("fraction")
 def joint_limits(state: TaskState, params: Params) -> Tensor:
     """How far joints are beyond the inner ``fraction`` of their range, summed, rad."""
-    middle = 0.5 * (state.joint_upper + state.joint_lower)
-    reach = 0.5 * params["fraction"] * (state.joint_upper - state.joint_lower)
-    return (state.robot.joint_position - middle).abs_().sub_(reach).clamp_(min=0.0).sum(1)
+    middle, reach = state.joint_range
+    return (state.robot.joint_position - middle).abs_().sub_(reach, alpha=params["fraction"]).clamp_(min=0.0).sum(1)
 
 
 @term()
@@ -257,7 +261,7 @@ def deviation_right_arm(state: TaskState, params: Params) -> Tensor:
 @term()
 def both_feet_air(state: TaskState, params: Params) -> Tensor:
     """No foot touches the floor."""
-    return (~state.foot_contact.any(1)).float()
+    return (state.measures["feet_down"] == 0.0).float()
 
 
 @term()

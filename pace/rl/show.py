@@ -73,13 +73,13 @@ class ChosenServes(ServeSampler):
 
     choice: Serve | None = None
 
-    def sample(self, num_worlds: int) -> tuple[Tensor, Tensor, Tensor]:
+    def sample(self, mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """As :meth:`ServeSampler.sample`."""
-        position, velocity, spin = super().sample(num_worlds)
+        position, velocity, spin = super().sample(mask)
         if self.choice is None:
             return position, velocity, spin
         chosen = (self.choice.velocity(), self.choice.spin())
-        velocity, spin = (torch.tensor(value, device=position.device).repeat(num_worlds, 1) for value in chosen)
+        velocity, spin = (torch.tensor(value, device=position.device).repeat(len(mask), 1) for value in chosen)
         return position, velocity, spin
 
 
@@ -93,7 +93,9 @@ class ShowEnv(TableTennisEnv):
 
     def _build(self, predictor: Predictor | None) -> None:
         super()._build(predictor)
-        self._serves = self.chosen = ChosenServes(self.config.serve, self.generator, self.worlds.device)
+        self._serves = self.chosen = ChosenServes(
+            self.config.serve, self.num_worlds, self.generator, self.worlds.device
+        )
 
     def end_serve(self) -> None:
         """The present serve's time is up; the next one begins with the next control step."""

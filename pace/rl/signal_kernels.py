@@ -90,12 +90,30 @@ def read_prediction(
     shift[world] = stand - wp.vec2(base[0], base[1]) + shift_noise[world]
 
 
+@wp.struct
+class SignalArrays:
+    """One observation: where it is kept, and its first column in a frame."""
+
+    values: wp.array2d[wp.float32]
+    start: int
+
+
 @wp.kernel
-def fill_frames(mask: wp.array[wp.bool], frame: wp.array2d[wp.float32], observation: wp.array2d[wp.float32]):
-    """Make all frames of the masked worlds the newest one."""
+def fill_frames(
+    mask: wp.array[wp.bool],
+    signals: wp.array[SignalArrays],
+    frame: wp.array2d[wp.float32],
+    observation: wp.array2d[wp.float32],
+):
+    """Put the signals of the masked worlds into their newest frame, and make all their frames that one."""
     world = wp.tid()
     if not mask[world]:
         return
+    for i in range(signals.shape[0]):
+        start = signals[i].start
+        values = signals[i].values
+        for column in range(values.shape[1]):
+            frame[world, start + column] = values[world, column]
     row = observation[world]
     size = frame.shape[1]
     for i in range(row.shape[0]):

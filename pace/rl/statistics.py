@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
+import warp as wp
 from torch import Tensor
 
-from pace.rl.task import Outcome
-
-if TYPE_CHECKING:
-    from pace.rl.env import TableTennisEnv
+from pace.rl.task import Game, Outcome
+from pace.sim.sharing import record, share
 
 #: Outcomes that serves are counted by; ``outcome/success`` and the others add up to ``serves``.
 COUNTED = tuple(outcome for outcome in Outcome if outcome not in (Outcome.OPEN, Outcome.BAD_SERVE))
@@ -26,6 +23,46 @@ NAMES = (
     *(f"outcome/{outcome.name.lower()}" for outcome in COUNTED),
 )
 
+SERVES, HITS, RIM_HITS, SUCCESSES, BAD_SERVES, FALLS, EPISODES, STEPS = (wp.constant(i) for i in range(8))
+#: Outcomes have their columns in the order of their codes, the first of which is 1.
+OUTCOMES = wp.constant(len(NAMES) - len(COUNTED) - 1)
+SUCCESS, BAD_SERVE = wp.constant(int(Outcome.SUCCESS)), wp.constant(int(Outcome.BAD_SERVE))
+
+
+@wp.kernel
+def _count(
+    over: wp.array[wp.bool],
+    outcome: wp.array[wp.int32],
+    hit: wp.array[wp.bool],
+    rim: wp.array[wp.bool],
+    lost: wp.array[wp.bool],
+    truncated: wp.array[wp.bool],
+    played: wp.array[wp.float32],
+    first_counted: wp.array[wp.float32],
+    sums: wp.array[wp.float32],
+):
+    """Count one world's step. The sums are whole numbers, so the order in which worlds add to them does not matter."""
+    world = wp.tid()
+    if world == 0:
+        wp.atomic_add(sums, STEPS, float(over.shape[0]))
+    if lost[world]:
+        wp.atomic_add(sums, FALLS, 1.0)
+    if lost[world] or truncated[world]:
+        wp.atomic_add(sums, EPISODES, 1.0)
+    if not over[world] or played[world] < first_counted[0]:
+        return
+    if outcome[world] == BAD_SERVE:
+        wp.atomic_add(sums, BAD_SERVES, 1.0)
+        return
+    wp.atomic_add(sums, SERVES, 1.0)
+    wp.atomic_add(sums, OUTCOMES + outcome[world], 1.0)
+    if outcome[world] == SUCCESS:
+        wp.atomic_add(sums, SUCCESSES, 1.0)
+    if hit[world]:
+        wp.atomic_add(sums, HITS, 1.0)
+        if rim[world]:
+            wp.atomic_add(sums, RIM_HITS, 1.0)
+
 
 class Statistics:
     """Sums over worlds and control steps since the last :meth:`pop`.
@@ -35,23 +72,17 @@ class Statistics:
     at their end, and not while a world plays its first ``env.warmup_serves``.
     """
 
-    def __init__(self, num_worlds: int, device: torch.device) -> None:
-        self.sums = torch.zeros(len(NAMES), device=device)
-        self._codes = torch.tensor([int(outcome) for outcome in COUNTED], device=device).unsqueeze(-1)
-        self._one_step = torch.ones(num_worlds, dtype=torch.bool, device=device)
+    def __init__(self, game: Game, first_counted: Tensor) -> None:
+        """Of ``game``, where a world's serves count from number ``first_counted`` (0-d) on."""
+        ends, played = game.ends, game.clock.played
+        self.sums = torch.zeros(len(NAMES), device=played.device)
+        tensors = (ends.over, ends.outcome, game.referee.hit, game.referee.rim, ends.lost, ends.truncated, played)
+        inputs = [share(tensor) for tensor in (*tensors, first_counted.view(1), self.sums)]
+        self._count = record(_count, len(played), inputs, played.device)
 
-    def add(self, env: TableTennisEnv) -> None:
-        """Count the step that ``env`` just made."""
-        referee = env.game.referee
-        ended = env.serve_over & (env.game.clock.played >= env.first_counted_serve)
-        bad = env.serve_outcome == Outcome.BAD_SERVE
-        counted = ended & ~bad
-        hit = counted & referee.hit
-        success = counted & (env.serve_outcome == Outcome.SUCCESS)
-        done = env.terminated | env.truncated
-        flags = (counted, hit, hit & referee.rim, success, ended & bad, env.terminated, done, self._one_step)
-        outcomes = (env.serve_outcome == self._codes) & counted
-        self.sums += torch.cat((torch.stack(flags), outcomes)).sum(1)
+    def add(self) -> None:
+        """Count the control step that was just judged, before the clock counts its serves."""
+        self._count()
 
     def pop(self) -> dict[str, Tensor]:
         """The sums by name, as 0-d tensors; starts anew."""

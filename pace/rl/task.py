@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import torch
+import warp as wp
 from torch import Tensor
 
 from pace.config import ResetConfig, RewardConfig, RobotConfig, ServeConfig, TaskConfig
@@ -16,7 +17,7 @@ from pace.rl import task_kernels
 from pace.rl.outcome import Outcome
 from pace.rl.task_kernels import GameArrays, Rules
 from pace.sim.ball_kernels import EventArrays, ForecastArrays
-from pace.sim.randomization import bounds, uniform
+from pace.sim.draws import Column, Draws, columns_of
 from pace.sim.sharing import record, share, share_all
 from pace.sim.snapshot import restore, snapshot, under_prefix, with_prefix
 
@@ -29,15 +30,21 @@ __all__ = ["Game", "Outcome", "PoseSampler", "ServeSampler"]
 class ServeSampler:
     """Draws where serves start and how fast they are."""
 
-    def __init__(self, config: ServeConfig, generator: torch.Generator, device: torch.device) -> None:
+    def __init__(
+        self, config: ServeConfig, num_worlds: int, generator: torch.Generator, device: torch.device | str
+    ) -> None:
+        launch = torch.zeros(num_worlds, 9, device=device)
+        self._launch = launch[:, :3], launch[:, 3:6], launch[:, 6:]
         ranges = [config.x, config.y, config.z, config.vx, config.vy, config.vz, config.spin, config.spin, config.spin]
-        self._low, self._high = bounds(ranges, device)
-        self._generator = generator
+        self._draw = Draws(columns_of(launch, ranges), generator)
 
-    def sample(self, num_worlds: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Position m, velocity m/s and spin rad/s, each (N, 3), world frame."""
-        position, velocity, spin = uniform(self._generator, self._low, self._high, num_worlds).split(3, dim=1)
-        return position, velocity, spin
+    def sample(self, mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Position m, velocity m/s and spin rad/s, each (N, 3), world frame: new in the worlds of ``mask`` (N,) bool.
+
+        The tensors are the same ones each time.
+        """
+        self._draw(mask)
+        return self._launch
 
 
 class PoseSampler:
@@ -47,36 +54,47 @@ class PoseSampler:
         self,
         config: ResetConfig,
         robot: RobotConfig,
+        num_worlds: int,
         nominal: Tensor,
         limits: tuple[Tensor, Tensor],
         joint_names: tuple[str, ...],
         generator: torch.Generator,
     ) -> None:
-        self._generator, self._limits = generator, limits
-        self._height = robot.base_height
-        ranges = [config.base_x, config.base_y, config.yaw, *[config.linear_velocity] * 3]
-        ranges += [config.roll_pitch_rate, config.roll_pitch_rate, config.yaw_rate]
-        for name, angle in zip(joint_names, nominal.tolist(), strict=True):
-            right_arm = name.startswith("Right") and ("Shoulder" in name or "Elbow" in name)
-            if right_arm:
-                ranges.append([angle + end for end in config.right_arm_offset])
-            else:
-                ranges.append([angle * end for end in config.joint_scale])
-        self._low, self._high = bounds(ranges, nominal.device)
+        device, joints = nominal.device, nominal.shape[0]
+        self._qpos = torch.zeros(num_worlds, 7 + joints, device=device)
+        self._qvel = torch.zeros(num_worlds, 6 + joints, device=device)
+        self._qpos[:, 2] = robot.base_height
+        yaw = torch.zeros(num_worlds, device=device)
+        columns = columns_of(self._qpos[:, :2], [config.base_x, config.base_y])
+        columns.append(Column(yaw, *config.yaw))
+        rates = [config.roll_pitch_rate, config.roll_pitch_rate, config.yaw_rate]
+        columns += columns_of(self._qvel[:, :6], [*[config.linear_velocity] * 3, *rates])
+        ends = zip(*(limit.tolist() for limit in limits), strict=True)
+        ranges = _joint_ranges(config, joint_names, nominal.tolist())
+        columns += columns_of(self._qpos[:, 7:], [(*pair, *end) for pair, end in zip(ranges, ends, strict=True)])
+        self._draw = Draws(columns, generator)
+        self._turn = record(task_kernels.turn, num_worlds, [share(yaw), wp.from_torch(self._qpos)], device)
 
-    def sample(self, num_worlds: int) -> tuple[Tensor, Tensor]:
-        """qpos (N, 7 + J) and qvel (N, 6 + J) of MuJoCo; joints within their limits and at rest."""
-        sample = uniform(self._generator, self._low, self._high, num_worlds)
-        joints = sample.shape[1] - 9
-        qpos, qvel = sample.new_zeros(num_worlds, 7 + joints), sample.new_zeros(num_worlds, 6 + joints)
-        qpos[:, :2] = sample[:, :2]
-        qpos[:, 2] = self._height
-        half_yaw = 0.5 * sample[:, 2]
-        torch.cos(half_yaw, out=qpos[:, 3])
-        torch.sin(half_yaw, out=qpos[:, 6])
-        torch.clamp(sample[:, 9:], *self._limits, out=qpos[:, 7:])
-        qvel[:, :6] = sample[:, 3:9]
-        return qpos, qvel
+    def sample(self, mask: Tensor) -> tuple[Tensor, Tensor]:
+        """qpos (N, 7 + J) and qvel (N, 6 + J) of MuJoCo; joints within their limits and at rest.
+
+        New in the worlds of ``mask`` (N,) bool; the tensors are the same ones each time.
+        """
+        self._draw(mask)
+        self._turn()
+        return self._qpos, self._qvel
+
+
+def _joint_ranges(config: ResetConfig, names: tuple[str, ...], nominal: list[float]) -> list[tuple[float, float]]:
+    """Lowest and highest angle of each joint at the start of an episode, rad."""
+    ranges = []
+    for name, angle in zip(names, nominal, strict=True):
+        if name.startswith("Right") and ("Shoulder" in name or "Elbow" in name):
+            low, high = (angle + end for end in config.right_arm_offset)
+        else:
+            low, high = (angle * end for end in config.joint_scale)
+        ranges.append((low, high))
+    return ranges
 
 
 class Part:
@@ -176,31 +194,22 @@ class ServeClock(Part):
         self.index = torch.zeros(num_worlds, device=device)
         self.played = torch.zeros(num_worlds, device=device)
         self.fresh = torch.ones(num_worlds, dtype=torch.bool, device=device)
+        self._mask = torch.zeros(num_worlds, dtype=torch.bool, device=device)
+        self._seed = torch.zeros(1, dtype=torch.int32, device=device)
+        serves = config.serves_per_episode if config.random_phase else 0
+        inputs = [share(self._mask), share(self._seed), serves, share(self.fresh), share(self.index)]
+        self._start = record(task_kernels.start_episode, num_worlds, inputs, device)
 
     def start_episode(self, mask: Tensor, generator: torch.Generator) -> None:
         """First serve of an episode; a world's first episode may begin at a random serve, so that ends spread out."""
-        count = self._config.serves_per_episode
-        first = torch.rand(self.index.shape, device=self.index.device, generator=generator).mul_(count).floor_()
-        random = self.fresh & (self._config.random_phase and count > 0)
-        self.index.copy_(torch.where(mask, first * random, self.index))
-        self.fresh &= ~mask
+        self._mask.copy_(mask)
+        self._seed.random_(generator=generator)
+        self._start()
 
     def finish(self, over: Tensor) -> None:
         """Count the serves that ended (N,) bool."""
         self.index += over
         self.played += over
-
-    @property
-    def serve_progress(self) -> Tensor:
-        """Share of the longest serve (N,)."""
-        return self.time / self._config.max_duration
-
-    @property
-    def episode_progress(self) -> Tensor:
-        """Share of the episode's serves (N,), 0 where episodes do not end."""
-        if self._config.serves_per_episode == 0:
-            return torch.zeros_like(self.time)
-        return ((self.index + self.serve_progress) / self._config.serves_per_episode).clamp(max=1.0)
 
 
 class StepEnds(Part):

@@ -323,6 +323,34 @@ def start_serve(
     game.something_to_hit[world] = _something_to_hit(game, position[world], velocity[world], rules, world)
 
 
+@wp.kernel
+def start_episode(
+    mask: wp.array[wp.bool],
+    seed: wp.array[wp.int32],
+    serves: int,
+    fresh: wp.array[wp.bool],
+    index: wp.array[wp.float32],
+):
+    """First serve of an episode, in the masked worlds: any of ``serves`` where the world is fresh."""
+    world = wp.tid()
+    if not mask[world]:
+        return
+    first = 0.0
+    if fresh[world] and serves > 0:
+        random = wp.rand_init(seed[0], world)
+        first = wp.min(wp.floor(wp.randf(random) * float(serves)), float(serves - 1))
+    index[world] = first
+    fresh[world] = False
+
+
+@wp.kernel
+def turn(yaw: wp.array[wp.float32], qpos: wp.array2d[wp.float32]):
+    """The quaternion of a robot that stands upright, turned by ``yaw`` rad."""
+    world = wp.tid()
+    qpos[world, 3] = wp.cos(0.5 * yaw[world])
+    qpos[world, 6] = wp.sin(0.5 * yaw[world])
+
+
 @wp.struct
 class DerivedArrays:
     """What rewards and the critic share: tensors of :class:`pace.rl.state.TaskState`."""
@@ -335,6 +363,10 @@ class DerivedArrays:
     foot_load: wp.array2d[wp.float32]
     foot_contact: wp.array2d[wp.bool]
     feet_distance: wp.array[wp.float32]
+    paddle_to_target: wp.array[wp.vec3]
+    joint_offset: wp.array2d[wp.float32]
+    serve_progress: wp.array[wp.float32]
+    episode_progress: wp.array[wp.float32]
 
 
 @wp.kernel
@@ -344,6 +376,9 @@ def derive(
     position: wp.array[wp.vec3],
     velocity: wp.array[wp.vec3],
     base_position: wp.array[wp.vec3],
+    paddle_position: wp.array[wp.vec3],
+    joint_position: wp.array2d[wp.float32],
+    nominal: wp.array[wp.float32],
     foot_force: wp.array3d[wp.float32],
     foot_position: wp.array3d[wp.float32],
     rules: Rules,
@@ -369,6 +404,15 @@ def derive(
     derived.apex[world] = apex
     derived.target[world] = target
     derived.arrival[world] = arrival
+    derived.paddle_to_target[world] = target - paddle_position[world]
+    for joint in range(nominal.shape[0]):
+        derived.joint_offset[world, joint] = joint_position[world, joint] - nominal[joint]
+    progress = game.time[world] / rules.max_duration
+    derived.serve_progress[world] = progress
+    episode = 0.0
+    if rules.serves_per_episode > 0:
+        episode = wp.min((game.index[world] + progress) / float(rules.serves_per_episode), 1.0)
+    derived.episode_progress[world] = episode
     derived.base_error[world] = goal - base
     derived.shift[world] = shift_goal - base
     apart = wp.vec3()

@@ -5,6 +5,7 @@ Frame: origin on the floor below the table's centre, x towards the opponent, z u
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import lru_cache
 
@@ -23,7 +24,7 @@ from pace.sim.ball_kernels import (
 )
 from pace.sim.flight import Scene
 from pace.sim.rebound import Material
-from pace.sim.sharing import share, share_all, torch_stream
+from pace.sim.sharing import record, share, share_all, torch_stream
 
 __all__ = ["FORECAST_HORIZON", "BallEvents", "BallParams", "BallSim", "Forecast", "ball_preset"]
 
@@ -267,10 +268,12 @@ class BallSim:
         self._ask_mask = torch.zeros(num_worlds, dtype=torch.bool, device=device)
         self._ask = torch.zeros(3, num_worlds, 3, device=device)
         self._scene = _scene(table, self._path, control_dt / substeps)
-        self._record(ball_dt)
+        self._ball_dt = ball_dt
+        self._ahead: tuple[float | None, Callable[[Tensor], None] | None] = (None, None)
+        self._record()
 
-    def _record(self, ball_dt: float) -> None:
-        """Record both launches, so that a call only replays them."""
+    def _record(self) -> None:
+        """Record the flight's launch, so that a call only replays it."""
         device = wp.device_from_torch(self.device)
         ball = [share(self.position), share(self.velocity), share(self.spin)]
         params = wp.from_torch(self._param_matrix)
@@ -284,26 +287,12 @@ class BallSim:
                 share_all(EventArrays, vars(self.events)),
                 share(self.nearest_paddle_distance),
                 self.control_dt,
-                ball_dt,
+                self._ball_dt,
             ],
             device=device,
             record_cmd=True,
         )
-        self._forecast_launch = wp.launch(
-            forecast_flight,
-            dim=self.num_worlds,
-            inputs=[
-                share(self._ask_mask),
-                *(share(tensor) for tensor in self._ask),
-                params,
-                self._scene,
-                share_all(ForecastArrays, vars(self.forecast_result)),
-                0.0,
-                ball_dt,
-            ],
-            device=device,
-            record_cmd=True,
-        )
+        self._forecast_inputs = [params, self._scene, share_all(ForecastArrays, vars(self.forecast_result))]
 
     def _launch(self, launch: wp.Launch) -> None:
         """Replay a launch on torch's current stream, so that it keeps its place among torch's own kernels."""
@@ -342,8 +331,22 @@ class BallSim:
         Fills their rows of ``forecast_result`` and leaves the others; ``intercept_x`` is in m. The flight passes
         through paddles; net, table and floor are met.
         """
-        self._ask_mask.copy_(mask)
         for own, given in zip(self._ask, (position, velocity, spin), strict=True):
             own.copy_(given)
-        self._forecast_launch.set_param_by_name("intercept_x", intercept_x)
-        self._launch(self._forecast_launch)
+        if self._ahead[0] != intercept_x:
+            self._ahead = (intercept_x, self.forecaster(self._ask[0], self._ask[1], self._ask[2], intercept_x))
+        assert self._ahead[1] is not None
+        self._ahead[1](mask)
+
+    def forecaster(
+        self, position: Tensor, velocity: Tensor, spin: Tensor, intercept_x: float
+    ) -> Callable[[Tensor], None]:
+        """:meth:`forecast` of a mask, always from these tensors: it reads them where they lie, which saves copies."""
+        inputs = [share(self._ask_mask), share(position), share(velocity), share(spin), *self._forecast_inputs]
+        launch = record(forecast_flight, self.num_worlds, [*inputs, intercept_x, self._ball_dt], self.device)
+
+        def ahead(mask: Tensor) -> None:
+            self._ask_mask.copy_(mask)
+            launch()
+
+        return ahead

@@ -7,11 +7,14 @@ from typing import Protocol
 
 import mujoco
 import torch
+import warp as wp
 from torch import Tensor
 
 from pace.config import ConfigError, EngineConfig
+from pace.sim.engine_kernels import reset_state
 from pace.sim.graph import graphs_wanted
-from pace.sim.robot import FEET, TRUNK_BODY
+from pace.sim.robot import FEET
+from pace.sim.sharing import record
 
 
 @dataclass(frozen=True)
@@ -36,77 +39,6 @@ class EngineParams:
         values |= {"friction": float(model.pair_friction[0, 0]), "trunk_mass": 0.0, "trunk_com": 0.0}
         shapes = {name: (num_worlds, 3) if name == "trunk_com" else (num_worlds,) for name in values}
         return cls(**{name: torch.full(shapes[name], value, device=device) for name, value in values.items()})
-
-    def rows(self, ids: Tensor) -> EngineParams:
-        """A copy of the worlds ``ids`` (M,)."""
-        return EngineParams(**{f.name: getattr(self, f.name)[ids] for f in fields(self)})
-
-
-#: A change of a per-world model field: its name, where in one world's array, and the values (M, ...).
-FieldWrite = tuple[str, tuple[int | slice, ...], Tensor]
-
-
-class ModelFields:
-    """Which model fields follow the parameters, and how: both engines write what this class says."""
-
-    NAMES = (
-        "pair_friction",
-        "body_mass",
-        "body_subtreemass",
-        "body_inertia",
-        "body_ipos",
-        "actuator_gainprm",
-        "actuator_biasprm",
-        "actuator_forcerange",
-        "dof_armature",
-    )
-
-    def __init__(self, model: mujoco.MjModel, device: torch.device) -> None:
-        def constant(values: object) -> Tensor:
-            return torch.tensor(values, dtype=torch.float32, device=device)
-
-        self._trunk = int(model.body(TRUNK_BODY).id)
-        self._mass = float(model.body_mass[self._trunk])
-        self._subtree_mass = {body: float(model.body_subtreemass[body]) for body in (0, self._trunk)}
-        self._inertia = constant(model.body_inertia[self._trunk])
-        self._com = constant(model.body_ipos[self._trunk])
-        # what set_to_dcmotor and set_to_position of pace.sim.robot write
-        self._with_speed = bool((model.actuator_gaintype == mujoco.mjtGain.mjGAIN_DCMOTOR).all())
-        self._resistance = constant(model.actuator_gainprm[:, 0])
-        self._kp = constant(model.actuator_gainprm[:, 4 if self._with_speed else 0])
-        self._kd = constant(model.actuator_gainprm[:, 6] if self._with_speed else -model.actuator_biasprm[:, 2])
-        self._effort = constant(model.actuator_forcerange)
-        self._armature = constant(model.dof_armature[6:])
-
-    def writes(self, params: EngineParams) -> list[FieldWrite]:
-        """What the model fields of the M worlds of ``params`` must hold."""
-        trunk, everything, mass = self._trunk, slice(None), params.trunk_mass
-        growth = (1.0 + mass / self._mass).unsqueeze(-1)
-        return [
-            ("pair_friction", (everything, slice(2)), params.friction.view(-1, 1, 1)),  # both directions
-            ("body_mass", (trunk,), mass + self._mass),
-            *(("body_subtreemass", (body,), mass + nominal) for body, nominal in self._subtree_mass.items()),
-            ("body_inertia", (trunk,), growth * self._inertia),
-            ("body_ipos", (trunk,), params.trunk_com + self._com),
-            *self._motors(params),
-            ("actuator_forcerange", (everything,), params.effort_scale.view(-1, 1, 1) * self._effort),
-            ("dof_armature", (slice(6, None),), params.armature_scale.unsqueeze(-1) * self._armature),
-        ]
-
-    def _motors(self, params: EngineParams) -> list[FieldWrite]:
-        every = slice(None)
-        kp, kd = params.kp_scale.unsqueeze(-1) * self._kp, params.kd_scale.unsqueeze(-1) * self._kd
-        if not self._with_speed:
-            return [
-                ("actuator_gainprm", (every, 0), kp),
-                ("actuator_biasprm", (every, 1), -kp),
-                ("actuator_biasprm", (every, 2), -kd),
-            ]
-        return [
-            ("actuator_gainprm", (every, 0), self._resistance / params.effort_scale.unsqueeze(-1)),
-            ("actuator_gainprm", (every, 4), kp),
-            ("actuator_gainprm", (every, 6), kd),
-        ]
 
 
 class RobotEngine(Protocol):
@@ -187,6 +119,24 @@ class StateTensors:
         self.body_contact = torch.zeros(num_worlds, model.nsensordata - 3 * len(FEET), device=device)
         self.joint_torque = torch.zeros(num_worlds, model.nu, device=device)
         self.qpos_path.copy_(torch.as_tensor(model.key_qpos[0], dtype=torch.float32))
+        self._mask = torch.zeros(num_worlds, dtype=torch.bool, device=device)
+        self._start: tuple[Tensor | None, ...] = (None, None)
+
+    def _solver_state(self) -> tuple[Tensor, Tensor, Tensor]:
+        """qpos (N, 28), qvel (N, 27) and warm start (N, 27) of the engine itself, in its precision."""
+        raise NotImplementedError
+
+    def reset(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
+        """See :class:`RobotEngine`. Give the same tensors each time: others are bound anew, which takes longer."""
+        if self._start[0] is not qpos or self._start[1] is not qvel:
+            self._bind_start(qpos, qvel)
+        self._mask.copy_(mask)
+        self._reset()
+
+    def _bind_start(self, qpos: Tensor, qvel: Tensor) -> None:
+        self._start = (qpos, qvel)
+        tensors = (self._mask, qpos, qvel, *self._solver_state(), *self._outputs().values())
+        self._reset = record(reset_state, self.num_worlds, [wp.from_torch(t) for t in tensors], self.device)
 
     def _outputs(self) -> dict[str, Tensor]:
         names = ("qpos_path", "qvel_path", "foot_force", "body_contact", "joint_torque")

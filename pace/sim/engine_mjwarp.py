@@ -9,8 +9,9 @@ import warp as wp
 from torch import Tensor
 
 from pace.config import EngineConfig
-from pace.sim.engine import ModelFields, StateTensors
+from pace.sim.engine import StateTensors
 from pace.sim.graph import CapturedCall, RecordedLaunches, graphs_wanted
+from pace.sim.model_fields import ModelFields
 from pace.sim.sharing import warp_scope
 
 #: Overflows that drop contacts or constraints. The solver's iteration limits, which share the bit mask, do not.
@@ -57,7 +58,6 @@ class MjwarpEngine(StateTensors):
         self, model: mujoco.MjModel, engine: EngineConfig, num_worlds: int, device: torch.device, substeps: int
     ) -> None:
         super().__init__(model, num_worlds, device, substeps, engine.physics_dt)
-        self._fields = ModelFields(model, device)
         with warp_scope(device):
             self.model = mjw.put_model(model, batch_sizes=dict.fromkeys(ModelFields.NAMES, num_worlds))
             self.model.opt.warn_overflow = 0  # a line a world a step; overflowed() tells
@@ -67,7 +67,8 @@ class MjwarpEngine(StateTensors):
             self.data = mjw.make_data(
                 model, num_worlds, nconmax=engine.contacts_per_world, njmax=engine.constraints_per_world
             )
-        self._model = {name: wp.to_torch(getattr(self.model, name)) for name in ModelFields.NAMES}
+        fields = {name: wp.to_torch(getattr(self.model, name)) for name in ModelFields.NAMES}
+        self._fields = ModelFields(model, self.params, fields)
         data = self.data
         self._qpos, self._qvel = wp.to_torch(data.qpos), wp.to_torch(data.qvel)
         self._warmstart, self._applied = wp.to_torch(data.qacc_warmstart), wp.to_torch(data.qfrc_applied)
@@ -101,19 +102,11 @@ class MjwarpEngine(StateTensors):
         inputs = [self.data.qpos, self.data.qvel, instant, *self._warp_path]
         wp.launch(_record_state, dim=self.num_worlds, inputs=inputs)
 
-    def reset(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
-        wide = mask.unsqueeze(-1)
-        for state, path, values in ((self._qpos, self.qpos_path, qpos), (self._qvel, self.qvel_path, qvel)):
-            state.copy_(torch.where(wide, values, state))
-            path.copy_(torch.where(wide.unsqueeze(-1), values.unsqueeze(1), path))
-        for tensor in (self._warmstart, self.body_contact, self.joint_torque):
-            tensor.masked_fill_(wide, 0.0)
-        self.foot_force.masked_fill_(wide.unsqueeze(-1), 0.0)
+    def _solver_state(self) -> tuple[Tensor, Tensor, Tensor]:
+        return self._qpos, self._qvel, self._warmstart
 
     def apply_params(self, mask: Tensor) -> None:
-        for name, index, values in self._fields.writes(self.params):
-            target = self._model[name][:, *index]
-            target.copy_(torch.where(mask.view(-1, *[1] * (target.dim() - 1)), values, target))
+        self._fields.write(mask)
 
     def add_velocity(self, delta: Tensor) -> None:
         self._qvel += delta

@@ -14,7 +14,8 @@ from mujoco.batch import Batch
 from torch import Tensor
 
 from pace.config import ConfigError, EngineConfig
-from pace.sim.engine import ModelFields, StateTensors
+from pace.sim.engine import StateTensors
+from pace.sim.model_fields import ModelFields
 from pace.team import usable_cores
 
 _CONTROL = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
@@ -37,8 +38,8 @@ class NativeEngine(StateTensors):
         # a state that is not finite stays so and is seen; MuJoCo would put that robot back on its feet without a word
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         self._batch = batch = Batch(model, num_worlds, engine.threads or usable_cores())
-        self._fields = ModelFields(model, device)
-        self._model = {name: batch.expand(name) for name in ModelFields.NAMES}
+        fields = {name: torch.from_numpy(batch.expand(name)) for name in ModelFields.NAMES}
+        self._fields = ModelFields(model, self.params, fields)
         self._qpos, self._qvel = batch.bind("qpos"), batch.bind("qvel")
         self._warmstart = batch.bind("qacc_warmstart")
         self._control = np.zeros((num_worlds, substeps, model.nu + model.nv))
@@ -61,21 +62,12 @@ class NativeEngine(StateTensors):
             path[:, 1:] = self._record[name]
         self._read_sensors(self._sensordata, self._actuator_force)
 
-    def reset(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
-        ids = mask.numpy().nonzero()[0]
-        states = (("qpos", self._qpos, qpos), ("qvel", self._qvel, qvel))
-        for name, state, values in states:
-            chosen = values.numpy()[ids]
-            state[ids] = chosen
-            self._paths[name][ids] = chosen[:, None]
-        self._warmstart[ids] = 0.0
-        for tensor in (self.foot_force, self.body_contact, self.joint_torque):
-            tensor.numpy()[ids] = 0.0
+    def _solver_state(self) -> tuple[Tensor, Tensor, Tensor]:
+        qpos, qvel, warmstart = (torch.from_numpy(array) for array in (self._qpos, self._qvel, self._warmstart))
+        return qpos, qvel, warmstart
 
     def apply_params(self, mask: Tensor) -> None:
-        ids = mask.nonzero().squeeze(-1)
-        for name, index, values in self._fields.writes(self.params.rows(ids)):
-            self._model[name][:, *index][ids.numpy()] = values.numpy()
+        self._fields.write(mask)
 
     def add_velocity(self, delta: Tensor) -> None:
         self._qvel += delta.numpy()

@@ -88,18 +88,22 @@ def _sense(
     truth: Truth,
     nominal: wp.array[wp.float32],
     delay: wp.array[wp.float32],
+    delays: wp.vec2,
     amplitude: wp.array[wp.float32],
     line: wp.array3d[wp.float32],
     sensed: wp.array2d[wp.float32],
     base_quat: wp.array[wp.vec4],
 ):
-    """Sense one world. With ``reset`` the masked worlds only, as if they had stood still; else their ball is new."""
+    """Sense one world. With ``reset`` the masked worlds only, as if they had stood still, with a new delay (control
+    steps, from the range ``delays``); else their ball is new."""
     world = wp.tid()
     if reset == 1 and not mask[world]:
         return
     _see(truth, line[world], world, mask[world], reset == 1)
     row = sensed[world]
     random = wp.rand_init(seed[world])
+    if reset == 1:
+        delay[world] = delays[0] + wp.randf(random) * (delays[1] - delays[0])
     for column in range(row.shape[0]):
         row[column] = amplitude[column] * (2.0 * wp.randf(random) - 1.0)
     joints = nominal.shape[0]
@@ -139,7 +143,7 @@ class Sensing:
         nominal: Tensor,
         generator: torch.Generator,
     ) -> None:
-        self._low, self._high = (bound / control_dt for bound in config.mocap_delay)
+        self._delays = [bound / control_dt for bound in config.mocap_delay]  # least and most, in control steps
         self._num_worlds, self._device, self._generator = num_worlds, device, generator
         self._nominal = nominal
         joints = nominal.shape[0]
@@ -160,7 +164,7 @@ class Sensing:
         self.base_angular_velocity, self.projected_gravity, self.joint_position, self.joint_velocity = views[:4]
         self.base_position, self.ball_position, self.heading, self.base_shift_noise = views[4:]
         self.base_quat = torch.zeros(num_worlds, 4, device=device)
-        frames = max(2, math.ceil(self._high) + 1)
+        frames = max(2, math.ceil(self._delays[1]) + 1)
         self._line = torch.zeros(num_worlds, frames, MOCAP_COLUMNS, device=device)
         self._delay = torch.zeros(num_worlds, device=device)  # in control steps
         self._seed = torch.zeros(num_worlds, dtype=torch.int32, device=device)
@@ -179,9 +183,6 @@ class Sensing:
 
     def reset(self, mask: Tensor, robot: RobotState, ball_position: Tensor) -> None:
         """Draw new delays for the worlds of ``mask`` (N,) bool and sense them as if they had stood still so far."""
-        delay = torch.rand(mask.shape, device=mask.device, generator=self._generator)
-        delay = delay.mul_(self._high - self._low).add_(self._low)
-        self._delay.copy_(torch.where(mask, delay, self._delay))
         self._prepare(robot, ball_position, mask)
         self._reset()
 
@@ -198,9 +199,9 @@ class Sensing:
         for name in Truth.vars:  # type: ignore[attr-defined]
             if name != "ball_position":
                 setattr(truth, name, share(getattr(robot, name)))
-        state = (self._nominal, self._delay, self._amplitude, self._line, self._sensed)
-        quat = wp.from_torch(self.base_quat, dtype=wp.vec4)
-        shared = [share(self._seed), truth, *(wp.from_torch(tensor) for tensor in state), quat]
+        fixed = [wp.from_torch(self._nominal), wp.from_torch(self._delay), wp.vec2(*self._delays)]
+        state = [wp.from_torch(tensor) for tensor in (self._amplitude, self._line, self._sensed)]
+        shared = [share(self._seed), truth, *fixed, *state, wp.from_torch(self.base_quat, dtype=wp.vec4)]
         mask = share(self._mask)
         self._update = record(_sense, self._num_worlds, [mask, 0, *shared], self._device)
         self._reset = record(_sense, self._num_worlds, [mask, 1, *shared], self._device)

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from torch import Tensor
 
+#: Attributes that a call fills before it reads them.
+SCRATCH = ("_mask", "_seed")
+
 
 def _owned(owner: object) -> dict[str, Tensor]:
-    """Tensors that are attributes of ``owner``, without views of others and the mask that a call was given."""
-    tensors = {name: value for name, value in vars(owner).items() if isinstance(value, Tensor) and name != "_mask"}
-    return {name: value for name, value in tensors.items() if not value._is_view()}
+    """Tensors that are attributes of ``owner``, without views of others and the mask and seed of the last call."""
+    tensors = {name: value for name, value in vars(owner).items() if isinstance(value, Tensor)}
+    return {name: value for name, value in tensors.items() if name not in SCRATCH and not value._is_view()}
 
 
 def snapshot(owner: object) -> dict[str, Tensor]:

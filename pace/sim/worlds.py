@@ -16,7 +16,7 @@ from pace.sim.engine import make_engine, resolve_device
 from pace.sim.kinematics import Kinematics
 from pace.sim.randomization import Randomizer
 from pace.sim.robot import JOINT_NAMES, build_model, nominal_pose
-from pace.sim.sharing import record
+from pace.sim.sharing import record, share
 from pace.sim.snapshot import under_prefix, with_prefix
 
 
@@ -51,6 +51,8 @@ class RobotState:
 
 @wp.kernel
 def _derive(
+    mask: wp.array[wp.bool],
+    masked: int,
     qpos: wp.array3d[float],
     qvel: wp.array3d[float],
     last: int,
@@ -59,8 +61,11 @@ def _derive(
     heading: wp.array2d[float],
     acceleration: wp.array2d[float],
 ):
-    """Gravity in the body frame, heading on the ground and mean joint acceleration of one world."""
+    """Gravity in the body frame, heading on the ground and mean joint acceleration of one world; masked: of those of
+    the mask alone."""
     world = wp.tid()
+    if masked == 1 and not mask[world]:
+        return
     w = qpos[world, last, 3]
     x = qpos[world, last, 4]
     y = qpos[world, last, 5]
@@ -76,6 +81,50 @@ def _derive(
     for joint in range(acceleration.shape[1]):
         change = qvel[world, last, 6 + joint] - qvel[world, 0, 6 + joint]
         acceleration[world, joint] = change * inverse_dt
+
+
+@wp.kernel
+def _spread_delay(delay: wp.array[float], physics_dt: float, new_share: wp.array2d[float]):
+    """Share of each physics step that is left once the new target has passed the actuator delay."""
+    world = wp.tid()
+    for step in range(new_share.shape[1]):
+        new_share[world, step] = wp.clamp((float(step + 1) * physics_dt - delay[world]) / physics_dt, 0.0, 1.0)
+
+
+@wp.kernel
+def _stand(
+    mask: wp.array[wp.bool],
+    qpos: wp.array3d[float],
+    previous_targets: wp.array2d[float],
+    impulse: wp.array[wp.vec3],
+):
+    """A robot that was just reset holds its joints where they are, and feels nothing of the last ball."""
+    world = wp.tid()
+    if not mask[world]:
+        return
+    for joint in range(previous_targets.shape[1]):
+        previous_targets[world, joint] = qpos[world, 0, 7 + joint]
+    impulse[world] = wp.vec3()
+
+
+@wp.kernel
+def _launch_ball(
+    mask: wp.array[wp.bool],
+    position: wp.array2d[float],
+    velocity: wp.array2d[float],
+    spin: wp.array2d[float],
+    own_position: wp.array2d[float],
+    own_velocity: wp.array2d[float],
+    own_spin: wp.array2d[float],
+):
+    """Start a masked world's ball in a given state."""
+    world = wp.tid()
+    if not mask[world]:
+        return
+    for i in range(3):
+        own_position[world, i] = position[world, i]
+        own_velocity[world, i] = velocity[world, i]
+        own_spin[world, i] = spin[world, i]
 
 
 class Worlds:
@@ -142,14 +191,23 @@ class Worlds:
         self._new_share = torch.zeros(n, self.config.substeps, 1, device=device)
         self._applied = torch.zeros(n, self.model.nv, device=device)
         self._reaction, self._reaction_point = torch.zeros(n, 3, device=device), torch.zeros(n, 3, device=device)
-        starts = torch.arange(1, self.config.substeps + 1, device=device, dtype=torch.float32)
-        self._substep_ends = (starts * self.config.engine.physics_dt).unsqueeze(0)
-        paths = [wp.from_torch(self.engine.qpos_path), wp.from_torch(self.engine.qvel_path)]
-        derived = [wp.from_torch(t) for t in (self._gravity, self._heading, self._acceleration)]
-        inputs = [*paths, self.config.substeps, 1.0 / self.control_dt, *derived]
-        self._derive = record(_derive, n, inputs, self.device)
+        self._mask = torch.zeros(n, dtype=torch.bool, device=device)
+        self._launch: tuple[Tensor | None, ...] = (None, None, None)
+        self._record()
         self.robot = self._robot_state()
         self._update_delay()
+
+    def _record(self) -> None:
+        n, device, mask = self.num_worlds, self.device, share(self._mask)
+        qpos, qvel = wp.from_torch(self.engine.qpos_path), wp.from_torch(self.engine.qvel_path)
+        derived = [wp.from_torch(t) for t in (self._gravity, self._heading, self._acceleration)]
+        inputs = [qpos, qvel, self.config.substeps, 1.0 / self.control_dt, *derived]
+        self._derive = record(_derive, n, [mask, 0, *inputs], device)
+        self._derive_masked = record(_derive, n, [mask, 1, *inputs], device)
+        held = [wp.from_torch(self._previous_targets), share(self.ball.events.paddle_impulse)]
+        self._stand = record(_stand, n, [mask, qpos, *held], device)
+        delay, new_share = share(self.randomizer.actuator_delay), wp.from_torch(self._new_share.squeeze(-1))
+        self._update_delay = record(_spread_delay, n, [delay, self.config.engine.physics_dt, new_share], device)
 
     def _robot_state(self) -> RobotState:
         qpos, qvel = self.engine.qpos_path[:, -1], self.engine.qvel_path[:, -1]
@@ -211,13 +269,11 @@ class Worlds:
     def _observe(self, mask: Tensor | None = None) -> None:
         """Derive ``robot`` from the engine's paths; ``mask`` (N,) bool: the worlds in which they are new."""
         self.kinematics.update(self.engine.qpos_path, self.engine.qvel_path, mask)
-        self._derive()
-
-    def _update_delay(self) -> None:
-        """Share of each physics step that is left once the new target has passed the actuator delay."""
-        dt = self.config.engine.physics_dt
-        share = (self._substep_ends - self.randomizer.actuator_delay.unsqueeze(1)) / dt
-        self._new_share.copy_(share.clamp_(0.0, 1.0).unsqueeze(-1))
+        if mask is None:
+            self._derive()
+        else:
+            self._mask.copy_(mask)
+            self._derive_masked()
 
     def reset_robot(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
         """Put the robots of ``mask`` (N,) bool into state qpos (N, 28), qvel (N, 27) and draw their parameters anew."""
@@ -225,17 +281,25 @@ class Worlds:
         self._update_delay()
         self.engine.apply_params(mask)
         self.engine.reset(mask, qpos, qvel)
-        wide = mask.unsqueeze(-1)
-        torch.where(wide, qpos[:, 7:], self._previous_targets, out=self._previous_targets)
-        self.ball.events.paddle_impulse.masked_fill_(wide, 0.0)
         self._observe(mask)
+        self._stand()
 
     def serve(self, mask: Tensor, position: Tensor, velocity: Tensor, spin: Tensor) -> None:
-        """Start the ball of the worlds of ``mask`` at position (N, 3) m, velocity (N, 3) m/s, spin (N, 3) rad/s."""
-        wide = mask.unsqueeze(-1)
-        states = (self.ball.position, self.ball.velocity, self.ball.spin)
-        for target, value in zip(states, (position, velocity, spin), strict=True):
-            torch.where(wide, value, target, out=target)
+        """Start the ball of the worlds of ``mask`` at position (N, 3) m, velocity (N, 3) m/s, spin (N, 3) rad/s.
+
+        Give the same tensors each time: others are bound anew, which takes longer.
+        """
+        given = (position, velocity, spin)
+        if any(tensor is not bound for tensor, bound in zip(given, self._launch, strict=True)):
+            self._bind_launch(given)
+        self._mask.copy_(mask)
+        self._serve()
+
+    def _bind_launch(self, launch: tuple[Tensor, Tensor, Tensor]) -> None:
+        self._launch = launch
+        ball = (self.ball.position, self.ball.velocity, self.ball.spin)
+        tensors = [wp.from_torch(tensor) for tensor in (*launch, *ball)]
+        self._serve = record(_launch_ball, self.num_worlds, [share(self._mask), *tensors], self.device)
 
     def warn_of_overflow(self) -> None:
         """Warn, once, when a world ever had more contacts or constraints than there is room for: the engine has dropped

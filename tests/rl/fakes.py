@@ -79,7 +79,9 @@ def fake_robot(n: int) -> Any:
 class FakeKinematics:
     """A paddle that is always half a metre in front of the base and 0.3 m above it."""
 
-    def paddle_pose(self, base_position: Tensor, base_quat: Tensor, joint_position: Tensor) -> tuple[Tensor, Tensor]:
+    def paddle_pose(
+        self, base_position: Tensor, base_quat: Tensor, joint_position: Tensor, mask: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         return base_position + torch.tensor([0.5, 0.0, 0.3]), torch.tensor([1.0, 0.0, 0.0]).expand_as(base_position)
 
 

@@ -70,12 +70,16 @@ def test_predictor_slices() -> None:
 
 
 def test_history_is_oldest_first_and_filled_at_reset() -> None:
-    history = History(3, 2, 2, CPU)
+    kept = torch.zeros(2, 1)
+    history = History(3, [lambda: kept, lambda: 10.0 * kept, lambda: kept > 2.0])  # kept, computed, of another type
     for step in range(1, 5):
-        history.push([torch.full((2, 1), float(step)), torch.full((2, 1), 10.0 * step)])
-    assert history.observation[0].tolist() == [2.0, 20.0, 3.0, 30.0, 4.0, 40.0]
-    history.fill(torch.tensor([False, True]), [torch.full((2, 2), 7.0)])
-    assert history.observation.tolist() == [[2.0, 20.0, 3.0, 30.0, 4.0, 40.0], [7.0] * 6]
+        kept.fill_(float(step))
+        history.push()
+    assert history.observation[0].tolist() == [2.0, 20.0, 0.0, 3.0, 30.0, 1.0, 4.0, 40.0, 1.0]
+    kept.fill_(7.0)
+    history.fill(torch.tensor([False, True]))
+    expected = [[2.0, 20.0, 0.0, 3.0, 30.0, 1.0, 4.0, 40.0, 1.0], [7.0, 70.0, 1.0] * 3]
+    assert history.observation.tolist() == expected
 
 
 def test_ball_track_is_oldest_first_and_restarts_with_a_new_ball() -> None:
@@ -240,7 +244,7 @@ def policy_input(env: TableTennisEnv, change: Any = None) -> tuple[Tensor, Tenso
     env.sensing.update(env.worlds.robot, env.worlds.ball.position, no_new_ball)
     env.actor.track.update(env.sensing.ball_position, no_new_ball)
     env._compute_signals()
-    env._policy_history.push(env._policy_signals())
+    env._policy_history.push()
     frame, positions = env.policy_observation.clone(), env.predictor_input.clone()
     env.load_state_dict(state)
     return frame, positions

@@ -68,6 +68,14 @@ def test_measures_are_the_torch_formulas_on_random_states() -> None:
         "foot_slide": (robot.foot_velocity[..., :2].norm(dim=-1) * state.foot_contact).sum(1),
         "foot_steepness": (horizontal * state.foot_contact).amax(1),
         "paddle_to_head": (robot.paddle_position - robot.head_position).norm(dim=1),
+        "paddle_to_target": (robot.paddle_position - state.game.target.point).norm(dim=1),
+        "base_to_target": state.base_error.norm(dim=1),
+        "vertical_velocity": robot.base_linear_velocity[:, 2].square(),
+        "roll_pitch_rate": robot.base_angular_velocity[:, :2].square().sum(1),
+        "yaw_rate": robot.base_angular_velocity[:, 2].square(),
+        "base_tilt": robot.projected_gravity[:, :2].square().sum(1),
+        "contacts": robot.body_contact.sum(1),
+        "feet_down": state.foot_contact.sum(1).float(),
     }
     expected |= {name: deviation @ groups[name] for name in groups if name != "ankles"}
     assert state.measures.keys() == expected.keys()

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import torch
 
+from pace.rl.state import TaskState
 from pace.rl.task import Outcome, PoseSampler, ServeSampler
 from tests.rl.fakes import CPU, JOINT_NAMES, config, fake_game, set_events
 
@@ -285,8 +286,8 @@ def test_an_early_hit_is_an_arrival() -> None:
 
 
 def test_serves_are_drawn_in_range() -> None:
-    serve = config().serve
-    position, velocity, spin = ServeSampler(serve, torch.Generator().manual_seed(0), CPU).sample(4000)
+    serve, everyone = config().serve, torch.ones(4000, dtype=torch.bool)
+    position, velocity, spin = ServeSampler(serve, 4000, torch.Generator().manual_seed(0), CPU).sample(everyone)
     for value, low_high in zip(
         (*position.unbind(1), *velocity.unbind(1)),
         (serve.x, serve.y, serve.z, serve.vx, serve.vy, serve.vz),
@@ -304,7 +305,8 @@ def test_poses_are_drawn_in_range_and_within_joint_limits() -> None:
     nominal = torch.linspace(-0.6, 0.6, 21)
     limits = (torch.full((21,), -0.8), torch.full((21,), 0.8))
     generator = torch.Generator().manual_seed(0)
-    qpos, qvel = PoseSampler(task.reset, task.robot, nominal, limits, JOINT_NAMES, generator).sample(2000)
+    sampler = PoseSampler(task.reset, task.robot, 2000, nominal, limits, JOINT_NAMES, generator)
+    qpos, qvel = sampler.sample(torch.ones(2000, dtype=torch.bool))
     assert qpos.shape == (2000, 28)
     assert qvel.shape == (2000, 27)
     torch.testing.assert_close(qpos[:, 3:7].norm(dim=1), torch.ones(2000))
@@ -359,7 +361,10 @@ def test_episodes_count_five_serves_and_first_ones_start_anywhere() -> None:
     assert not clock.index.any()
     clock.finish(everyone)
     clock.time.fill_(0.9)
-    assert float(clock.episode_progress[0]) == pytest.approx(1.5 / 5)
+    state = TaskState(worlds, game)
+    state.derive()
+    assert float(state.serve_progress[0]) == pytest.approx(0.5)
+    assert float(state.episode_progress[0]) == pytest.approx(1.5 / 5)
 
 
 def test_endless_play_has_no_last_serve() -> None:
@@ -371,7 +376,9 @@ def test_endless_play_has_no_last_serve() -> None:
     game.close()
     assert game.ends.over.all()
     assert not game.ends.truncated.any()
-    assert not game.clock.episode_progress.any()
+    state = TaskState(worlds, game)
+    state.derive()
+    assert not state.episode_progress.any()
 
 
 def test_lost_positions() -> None:
