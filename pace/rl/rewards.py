@@ -276,6 +276,16 @@ def foot_slide(state: TaskState, params: Params) -> Tensor:
     return state.measures["foot_slide"]
 
 
+@term("reach", "sigma")
+def ready_stance(state: TaskState, params: Params) -> Tensor:
+    """Still feet where there is nothing to hit and the base is within ``reach`` m of where it should stand.
+
+    exp(-v / sigma), v the speeds of both feet summed, m/s: stepping on the spot earns less than standing.
+    """
+    ready = ~state.something_to_hit & (_length(state.base_error) < params["reach"])
+    return torch.exp(_length(state.robot.foot_velocity).sum(1) * (-1.0 / params["sigma"])) * ready
+
+
 @term("threshold", "limit")
 def foot_force(state: TaskState, params: Params) -> Tensor:
     """Force of each foot beyond ``threshold``, at most ``limit``, summed over the feet, N."""

@@ -42,7 +42,7 @@ def play(state: TaskState, distance: float, **times: Any) -> None:
 
 def test_every_term_of_the_paper_is_there_and_every_term_is_tested() -> None:
     assert set(PACE.terms) == set(TERMS)
-    assert set(PACE.terms) - set(PAPER.terms) == {"arrival", "return_velocity"}
+    assert set(PACE.terms) - set(PAPER.terms) == {"arrival", "ready_stance", "return_velocity"}
 
 
 def test_measures_are_the_torch_formulas_on_random_states() -> None:
@@ -289,6 +289,18 @@ def test_foot_slide_needs_contact() -> None:
     state.robot.foot_velocity[:, :, 0] = 1.0
     state.robot.foot_force[:, 0] = 0.0
     assert value("foot_slide", state) == pytest.approx(1.0)
+
+
+def test_ready_stance_is_for_still_feet_at_the_idle_place_while_there_is_nothing_to_hit() -> None:
+    state = fake_state()
+    assert value("ready_stance", state, PACE) == 0.0  # a ball to hit
+    state.ball.velocity[:, 0] = 1.0  # it moves away
+    assert value("ready_stance", state, PACE) == pytest.approx(1.0)
+    state.robot.foot_velocity[0, :, 0] = torch.tensor([0.06, -0.09])
+    sigma = PACE.terms["ready_stance"].params["sigma"]
+    assert value("ready_stance", state, PACE) == pytest.approx(math.exp(-0.15 / sigma))
+    state.robot.base_position[:, 1] += PACE.terms["ready_stance"].params["reach"] + 0.01
+    assert value("ready_stance", state, PACE) == 0.0
 
 
 def test_power_of_all_joints_and_of_the_ankles() -> None:
