@@ -57,7 +57,7 @@ def test_paper_ball_has_the_fitted_drag() -> None:
 
 def test_default_reward_is_the_paper_reward_with_its_changes() -> None:
     paper, ours = (load_train_config([f"reward={name}"]).reward for name in ("paper", "pace"))
-    assert set(ours.terms) == set(paper.terms) | {"arrival", "return_velocity"}
+    assert set(ours.terms) == set(paper.terms) | {"arrival", "ready_stance", "return_velocity"}
     changed = {name for name in paper.terms if paper.terms[name] != ours.terms[name]}
     assert changed == {"paddle_to_target", "success"}
 
