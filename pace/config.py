@@ -339,8 +339,17 @@ class AlgoConfig:
     observation_clip: float
     last_layer_gain: float
     autocast: str  # auto (bf16 where the hardware has it), bf16, fp32
+    later_steps: list[SchedulePoint] = field(default_factory=list)  # in place of steps from that many control steps on
+
+    def steps_at(self, samples: float) -> int:
+        """Control steps a world plays per update, ``samples`` control steps into the run."""
+        due = [point for point in self.later_steps if point.samples <= samples]
+        return int(max(due, key=lambda point: point.samples).value) if due else self.steps
 
     def __post_init__(self) -> None:
+        for point in self.later_steps:
+            whole = point.value >= 1 and point.value == int(point.value)
+            _require(whole, f"algo.later_steps: {point.value} is no number of steps")
         _require(self.autocast in ("auto", "bf16", "fp32"), "algo.autocast must be auto, bf16 or fp32")
         _require(0 < self.gamma <= 1, "algo.gamma must lie in (0, 1]")
         for name in ("steps", "epochs", "minibatches"):

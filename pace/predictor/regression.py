@@ -42,14 +42,22 @@ class PredictorTrainer:
         team: Team | None = None,
     ) -> None:
         device = next(network.parameters()).device
-        self.network, self.config, self.steps, self.team = network, config, steps, team or Team()
+        self.network, self.config, self.team = network, config, team or Team()
         self.updates = 0
         self.optimiser = torch.optim.Adam(network.parameters(), lr=config.learning_rate)
-        self.inputs = torch.zeros(steps, num_worlds, network.input_size, device=device)
-        self.targets = torch.zeros(steps, num_worlds, network.output_size, device=device)
-        self.valid = torch.zeros(steps, num_worlds, dtype=torch.bool, device=device)
-        self.time_to_apex = torch.zeros(steps, num_worlds, device=device)
+        self._num_worlds, self._device, self._first_steps = num_worlds, device, steps
         self._edges = torch.tensor(TIME_BINS, device=device)
+        self.resize(steps)
+
+    def resize(self, steps: int) -> None:
+        """Take rollouts of ``steps`` from now on; an update then has batches in proportion."""
+        worlds, device = self._num_worlds, self._device
+        self.steps = steps
+        self.inputs = torch.zeros(steps, worlds, self.network.input_size, device=device)
+        self.targets = torch.zeros(steps, worlds, self.network.output_size, device=device)
+        self.valid = torch.zeros(steps, worlds, dtype=torch.bool, device=device)
+        self.time_to_apex = torch.zeros(steps, worlds, device=device)
+        self._batches = max(1, round(self.config.batches_per_update * steps / self._first_steps))
 
     @property
     def frozen(self) -> bool:
@@ -94,13 +102,16 @@ class PredictorTrainer:
         return dict(zip(names, (100.0 * (totals[0] / totals[1]).sqrt()).tolist(), strict=True))
 
     def _fit(self) -> None:
-        """``batches_per_update`` steps of Adam on valid samples, drawn with replacement and without a host sync."""
+        """``batches_per_update`` steps of Adam, more for longer rollouts, on valid samples.
+
+        They are drawn with replacement and without a host sync.
+        """
         inputs, targets = self.inputs.flatten(0, 1), self.targets.flatten(0, 1)
         valid = self.valid.flatten()
         by_validity = torch.argsort(valid, descending=True, stable=True)
         count = valid.sum()
         rows = max(1, self.config.batch_size // self.team.size)
-        for _ in range(self.config.batches_per_update):
+        for _ in range(self._batches):
             draw = torch.rand(rows, device=valid.device)
             index = by_validity[(draw * count).long()]
             error = self.network.scaled(inputs[index]) - self.network.scale_target(targets[index])

@@ -73,7 +73,7 @@ class PPO:
             min_lr=config.learning_rate_min,
             max_lr=config.learning_rate_max,
         )
-        self._minibatch: TensorDict | None = None
+        self._minibatch: tuple[Rollout, TensorDict] | None = None
 
     def update(self, rollout: Rollout, samples: float) -> dict[str, float]:
         """Learn from one rollout, ``samples`` control steps into the run; returns the means of the update's metrics.
@@ -142,8 +142,8 @@ class PPO:
         }
 
     def _buffers(self, rollout: Rollout) -> TensorDict:
-        """The minibatch that all gathers write into; allocated at the first update."""
-        if self._minibatch is None:
+        """The minibatch that all gathers write into; allocated at the first update from that storage."""
+        if self._minibatch is None or self._minibatch[0] is not rollout:
             rows = rollout.steps * rollout.num_worlds // self.config.minibatches
             if rows < 1:
                 raise ConfigError(
@@ -152,9 +152,10 @@ class PPO:
                 )
             sources = self._sources(rollout)
             buffers = {name: torch.empty_like(source[:rows]) for name, source in sources.items()}
-            self._minibatch = TensorDict(buffers, batch_size=[rows])
-            self._minibatch["old_scale"] = rollout.scale.expand(rows, -1)
-        return self._minibatch
+            batch = TensorDict(buffers, batch_size=[rows])
+            batch["old_scale"] = rollout.scale.expand(rows, -1)
+            self._minibatch = rollout, batch
+        return self._minibatch[1]
 
     def _require_finite(self, metrics: dict[str, float]) -> None:
         for name, value in metrics.items():

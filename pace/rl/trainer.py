@@ -192,10 +192,18 @@ class Trainer:
 
     @property
     def _samples_per_update(self) -> int:
-        return self.team.size * self.num_worlds * self.config.algo.steps
+        return self.team.size * self.num_worlds * self.rollout.steps
+
+    def _fit_storage(self) -> None:
+        """Make room for as many steps as the next update is to have (``algo.later_steps``)."""
+        steps = self.config.algo.steps_at(self.samples)
+        if steps != self.rollout.steps:
+            self.rollout = Rollout(self.env, self.agent, steps)
+            self.regression.resize(steps)
 
     def update(self) -> dict[str, float]:
         """One rollout and what is learned from it; returns the row of metrics, without the times."""
+        self._fit_storage()
         norms = (self.agent.policy_norm, self.agent.critic_norm)
         before = [norm.moments() for norm in norms]
         self.rollout.begin()

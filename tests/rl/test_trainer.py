@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,7 @@ import torch
 from dummy import DummyTask
 from omegaconf import OmegaConf
 
-from pace.config import ConfigError, TrainConfig, load_train_config, parse, to_dict
+from pace.config import ConfigError, SchedulePoint, TrainConfig, load_train_config, parse, to_dict
 from pace.predictor.network import PredictorNetwork
 from pace.rl.checkpoint import CheckpointError, list_checkpoints, load_checkpoint
 from pace.rl.milestones import read_metrics
@@ -101,6 +102,27 @@ def test_two_and_two_updates_equal_four(tmp_path: Path) -> None:
     assert rows[0]["update"] == rows[1]["update"] == [1, 2, 3, 4]
     for column in ("mean_reward", "kl", "lr", "predictor_rmse_cm", "policy_std"):
         assert rows[0][column] == rows[1][column]
+
+
+def test_later_updates_can_be_longer_and_resume_exactly(tmp_path: Path) -> None:
+    def later(path: Path, samples: int, resume: bool = False) -> Trainer:
+        algo = replace(make_config().algo, later_steps=[SchedulePoint(2.0 * UPDATE, 18.0)])
+        trainer = make_trainer(path, resume=resume, algo=algo, samples=float(samples))
+        trainer.train()
+        return trainer
+
+    longer = WORLDS * 18
+    whole = later(tmp_path / "whole", 2 * UPDATE + 2 * longer)
+    assert read_metrics(tmp_path / "whole" / "metrics.csv")["samples"] == [
+        UPDATE, 2 * UPDATE, 2 * UPDATE + longer, 2 * UPDATE + 2 * longer
+    ]  # fmt: skip
+    assert whole.rollout.steps == whole.regression.steps == 18
+    later(tmp_path / "parts", 2 * UPDATE + longer)
+    resumed = later(tmp_path / "parts", 2 * UPDATE + 2 * longer, resume=True)
+    expected, found = all_weights(whole), all_weights(resumed)
+    assert all(torch.equal(expected[name], found[name]) for name in expected)
+    with pytest.raises(ConfigError, match=r"later_steps: 1\.5 is no number of steps"):
+        replace(make_config().algo, later_steps=[SchedulePoint(0.0, 1.5)])
 
 
 def test_rows_after_the_checkpoint_are_replaced_by_a_resume(tmp_path: Path) -> None:
