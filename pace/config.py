@@ -7,6 +7,7 @@ here say which keys exist and of what type they are; an unknown key, a wrong typ
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -70,7 +71,8 @@ class RobotConfig:
 
     def __post_init__(self) -> None:
         _require(self.control_dt > 0, "robot.control_dt must be positive")
-        _require(self.stall_ratio == 0 or self.stall_ratio >= 1, "robot.stall_ratio must be 0 (no limit) or at least 1")
+        known = self.stall_ratio == 0 or 1 <= self.stall_ratio < math.inf
+        _require(known, f"robot.stall_ratio must be 0 (no limit) or a number from 1 on, got {self.stall_ratio}")
         slow = [group.match for group in self.joint_groups if group.max_speed <= 0]
         _require(not (self.stall_ratio and slow), f"robot.stall_ratio needs the max_speed of the joint groups {slow}")
         _require(self.action_clip > 0, "robot.action_clip must be positive")
@@ -259,6 +261,7 @@ class ReturnMemoryConfig:
         for name in ("prior_hits", "reach", "closing_speed", "largest"):
             _require(getattr(self, name) > 0, f"observation.return_memory.{name} must be positive")
         _require(self.hits >= 1, "observation.return_memory.hits must be at least 1")
+        _require(0 <= self.prior <= self.largest, "observation.return_memory.prior must lie in [0, largest]")
 
 
 @dataclass

@@ -364,3 +364,5 @@ def check_term(name: str, params: Params) -> None:
     if missing or unknown:
         what = f"misses {sorted(missing)}" if missing else f"does not know {sorted(unknown)}"
         raise ConfigError(f"reward.terms.{name}.params {what}; it needs {list(TERMS[name].params)}")
+    if not params.get("sigma", 1.0) > 0:
+        raise ConfigError(f"reward.terms.{name}.params.sigma must be positive, got {params['sigma']}")

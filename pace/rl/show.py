@@ -78,8 +78,8 @@ class ChosenServes(ServeSampler):
         position, velocity, spin = super().sample(mask)
         if self.choice is None:
             return position, velocity, spin
-        chosen = (self.choice.velocity(), self.choice.spin())
-        velocity, spin = (torch.tensor(value, device=position.device).repeat(len(mask), 1) for value in chosen)
+        velocity.copy_(torch.tensor(self.choice.velocity()))
+        spin.copy_(torch.tensor(self.choice.spin()))
         return position, velocity, spin
 
 

@@ -189,7 +189,6 @@ class ServeClock(Part):
     """
 
     def __init__(self, config: ServeConfig, num_worlds: int, device: torch.device) -> None:
-        self._config = config
         self.time = torch.zeros(num_worlds, device=device)
         self.index = torch.zeros(num_worlds, device=device)
         self.played = torch.zeros(num_worlds, device=device)

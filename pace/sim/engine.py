@@ -14,7 +14,7 @@ from pace.config import ConfigError, EngineConfig
 from pace.sim.engine_kernels import reset_state
 from pace.sim.graph import graphs_wanted
 from pace.sim.robot import FEET
-from pace.sim.sharing import record
+from pace.sim.sharing import record, require_shape
 
 
 @dataclass(frozen=True)
@@ -134,6 +134,8 @@ class StateTensors:
         self._reset()
 
     def _bind_start(self, qpos: Tensor, qvel: Tensor) -> None:
+        for name, state, path in (("qpos", qpos, self.qpos_path), ("qvel", qvel, self.qvel_path)):
+            require_shape(name, state, (self.num_worlds, path.shape[2]))
         self._start = (qpos, qvel)
         tensors = (self._mask, qpos, qvel, *self._solver_state(), *self._outputs().values())
         self._reset = record(reset_state, self.num_worlds, [wp.from_torch(t) for t in tensors], self.device)

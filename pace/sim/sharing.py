@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import torch
@@ -24,6 +24,12 @@ def share_all(arrays: type, tensors: Mapping[str, Tensor]) -> Any:
     for name, variable in arrays.vars.items():  # type: ignore[attr-defined]
         setattr(struct, name, wp.from_torch(tensors[name], dtype=variable.type.dtype))
     return struct
+
+
+def require_shape(name: str, tensor: Tensor, shape: tuple[int, ...]) -> None:
+    """Kernels read by index, beyond the end of a tensor that is too small. Errors: ``ValueError`` that names it."""
+    if tensor.shape != shape:
+        raise ValueError(f"{name} must have shape {shape}, not {tuple(tensor.shape)}")
 
 
 def torch_stream(device: torch.device) -> wp.Stream:
@@ -52,6 +58,12 @@ def record(
 ) -> Callable[[], None]:
     """A launch, over N worlds for instance, that is only replayed when called, on torch's current stream."""
     launch = wp.launch(kernel, dim=dim, inputs=inputs, device=wp.device_from_torch(device), record_cmd=True)
+    return partial(_replay, launch, device, inputs)
+
+
+def _replay(launch: wp.Launch, device: torch.device, _kept: list[Any]) -> None:
+    """Launch again. ``_kept``: the arrays, which the launch itself knows by address."""
     if device.type == "cuda":
-        return lambda: launch.launch(stream=torch_stream(device))
-    return launch.launch
+        launch.launch(stream=torch_stream(device))
+    else:
+        launch.launch()

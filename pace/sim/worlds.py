@@ -16,7 +16,7 @@ from pace.sim.engine import make_engine, resolve_device
 from pace.sim.kinematics import Kinematics
 from pace.sim.randomization import Randomizer
 from pace.sim.robot import JOINT_NAMES, build_model, nominal_pose
-from pace.sim.sharing import record, share
+from pace.sim.sharing import record, require_shape, share
 from pace.sim.snapshot import under_prefix, with_prefix
 
 
@@ -296,6 +296,8 @@ class Worlds:
         self._serve()
 
     def _bind_launch(self, launch: tuple[Tensor, Tensor, Tensor]) -> None:
+        for name, state in zip(("position", "velocity", "spin"), launch, strict=True):
+            require_shape(name, state, (self.num_worlds, 3))
         self._launch = launch
         ball = (self.ball.position, self.ball.velocity, self.ball.spin)
         tensors = [wp.from_torch(tensor) for tensor in (*launch, *ball)]

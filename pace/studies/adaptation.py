@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import cycle
 from pathlib import Path
 
 import torch
@@ -115,7 +116,7 @@ def draw(found: Sequence[Adaptation], figure: Figure) -> None:
     serves = range(1, SERVES + 1)
     axes = figure.subplots(1, len(names), sharey=True)
     for panel, (axis, name) in enumerate(zip(axes, names, strict=True)):
-        for colour, adaptation in zip(COLOURS, found, strict=False):
+        for colour, adaptation in zip(cycle(COLOURS), found, strict=False):
             success = list(groups(adaptation).values())[panel]
             ends = [wilson(int(success[:, serve].sum()), success.shape[0]) for serve in range(SERVES)]
             axis.plot(serves, 100 * success.float().mean(0), color=colour, marker="o", ms=3, label=adaptation.policy)

@@ -56,12 +56,16 @@ class PostureRecorder(ServeRecorder):
         lean = torch.rad2deg(torch.acos((-robot.projected_gravity[:, 2]).clamp(-1.0, 1.0)))
         speed = robot.base_linear_velocity[:, :2].norm(dim=1)
         values = torch.stack(((~down).all(1).float(), lifted, state.measures["foot_slide"], speed, lean), dim=1)
-        something = state.something_to_hit
-        for phase, chosen in enumerate((something, ~something)):
+        counted, something = self.counting.clone(), state.something_to_hit
+        for phase, chosen in enumerate((something & counted, ~something & counted)):
             self.sums[phase] += values[chosen].sum(0)
             self.instants[phase] += chosen.sum()
-        self.touches += robot.body_contact.sum(0)
+        self.touches += robot.body_contact[counted].sum(0)
         super().observe()
+
+    def begin(self) -> None:
+        super().begin()
+        self._down |= self.env.terminated.unsqueeze(1)  # a reset puts both feet down
 
 
 @dataclass(frozen=True)

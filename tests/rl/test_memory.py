@@ -29,8 +29,8 @@ class Rally:
         self.paddle, self.normal = torch.zeros(1, 3), NORMAL.repeat(1, 1)
         self.memory = ReturnMemory(CONFIG, DT, self.track, self.turned, self.paddle, self.normal)
 
-    def hit(self, restitution: float, paddle: Tensor = PADDLE, away: Tensor | None = None) -> Tensor:
-        """Play a ball that is hit one step before it is seen to turn; its velocity just after the hit."""
+    def hit(self, restitution: float, paddle: Tensor = PADDLE, away: Tensor | None = None, last: int = 10) -> Tensor:
+        """Play a ball that is hit one step before it is seen to turn, up to instant ``last``; its velocity after it."""
         closing = torch.dot(BALL - paddle, NORMAL)
         after = BALL - (1.0 + restitution) * closing * NORMAL
         gravity = torch.tensor([0.0, 0.0, -GRAVITY])
@@ -39,7 +39,7 @@ class Rally:
             time = step * DT
             velocity = BALL if step <= 0 else after
             path.append(POINT + velocity * time + 0.5 * gravity * time**2)
-        for newest in range(4, len(path)):
+        for newest in range(4, last + 1):
             self.track.copy_(torch.stack(path[newest - 4 : newest + 1]).view(1, 15))
             time = (newest - 5) * DT
             self.paddle.copy_(POINT + paddle * time if away is None else away)
@@ -94,12 +94,12 @@ def test_a_new_ball_before_the_return_was_seen_leaves_the_memory_as_it_was() -> 
     rally = Rally()
     rally.hit(0.8)
     before = rally.memory.seen.clone()
-    rally.next_ball()
-    rally.turned.fill_(True)
-    rally.memory.update()
-    rally.next_ball()
-    rally.next_ball()
-    assert torch.equal(rally.memory.seen, before)
+    for last in (6, 7):  # seen to turn, one step after that; in the next its velocity would have been seen
+        rally.next_ball()
+        rally.hit(0.4, last=last)
+        for _ in range(3):
+            rally.next_ball()
+        assert torch.equal(rally.memory.seen, before)
 
 
 def test_it_can_be_forgotten_world_by_world() -> None:
@@ -166,5 +166,7 @@ def test_it_needs_its_numbers_and_five_frames() -> None:
     task = config("observation=memory", "predictor.frames=4")
     with pytest.raises(ConfigError, match=r"predictor.frames of 5 or more, got 4"):
         check_policy(task.observation, task.predictor)
+    with pytest.raises(ConfigError, match=r"return_memory.prior must lie in"):
+        config("observation=memory", "observation.return_memory.prior=nan")
     with pytest.raises(ConfigError, match=r"return_memory.reach must be positive"):
         config("observation=memory", "observation.return_memory.reach=0.0")

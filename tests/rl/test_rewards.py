@@ -348,6 +348,7 @@ def test_the_manager_sums_weight_times_step_times_scale() -> None:
         ("jump", {}, "unknown reward term 'reward.terms.jump'"),
         ("contact", {}, r"reward.terms.contact.params misses \['reach'\]"),
         ("contact", {"reach": 0.05, "reech": 1.0}, r"does not know \['reech'\]"),
+        ("arrival", {"sigma": 0.0}, r"reward.terms.arrival.params.sigma must be positive, got 0.0"),
     ],
 )
 def test_wrong_terms_are_named(name: str, params: dict[str, float], message: str) -> None:

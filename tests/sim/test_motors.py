@@ -1,6 +1,7 @@
 """The motors' torque in closed form, in both engines: a PD law, a line over speed, and a cap."""
 
 import dataclasses
+import math
 
 import mujoco
 import numpy as np
@@ -144,5 +145,6 @@ def test_without_the_keys_the_motors_are_those_of_before():
     assert (model.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED).all()
     with pytest.raises(ConfigError, match=r"max_speed.*Hip_Pitch"):
         dataclasses.replace(stored, stall_ratio=2.0)
-    with pytest.raises(ConfigError, match="stall_ratio"):
-        dataclasses.replace(CONFIG.robot, stall_ratio=0.5)
+    for wrong in (0.5, math.inf, math.nan):
+        with pytest.raises(ConfigError, match="stall_ratio"):
+            dataclasses.replace(CONFIG.robot, stall_ratio=wrong)

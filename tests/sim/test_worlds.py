@@ -58,6 +58,15 @@ def test_randomised_parameters_stay_in_range_and_change_only_masked_worlds() -> 
         assert (high == low) or not torch.equal(value[mask], before[name][mask]), name
 
 
+def test_states_of_another_shape_are_refused_by_name() -> None:
+    worlds = make_worlds(4)
+    everyone = torch.ones(4, dtype=torch.bool)
+    with pytest.raises(ValueError, match=r"qpos must have shape \(4, 28\), not \(1, 28\)"):
+        worlds.reset_robot(everyone, torch.zeros(1, 28), torch.zeros(4, 27))
+    with pytest.raises(ValueError, match=r"velocity must have shape \(4, 3\), not \(1, 3\)"):
+        worlds.serve(everyone, torch.zeros(4, 3), torch.zeros(1, 3), torch.zeros(4, 3))
+
+
 def test_pushes_come_in_their_interval_and_size() -> None:
     worlds = make_worlds(256, "randomization.push_velocity=[-0.2,0.2]", "randomization.push_interval=[1.0,2.0]")
     steps, pushes, largest = 200, 0, 0.0
