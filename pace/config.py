@@ -275,6 +275,11 @@ class ObservationConfig:
     critic_history: int
     return_memory: ReturnMemoryConfig | None = None  # needed by the observation last_return
 
+    @property
+    def memory(self) -> ReturnMemoryConfig | None:
+        """Numbers of the memory of returns, where the policy observes it."""
+        return self.return_memory if "last_return" in self.policy else None
+
     def __post_init__(self) -> None:
         _require(self.policy_history >= 1, "observation.policy_history must be at least 1")
         _require(self.critic_history >= 1, "observation.critic_history must be at least 1")

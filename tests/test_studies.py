@@ -11,6 +11,7 @@ import torch
 from pace.rl.loading import load_policy
 from pace.studies import motors, parity, posture, reaction, steps
 from pace.studies.__main__ import main
+from pace.studies.common import ENDLESS
 from pace.studies.swings import Swings, policy_swings, random_swings
 from tests.rl.saved import save_run
 
@@ -144,7 +145,7 @@ def test_posture_counts_the_time_of_each_phase_and_touches(tmp_path: Path) -> No
 
 
 def test_a_hop_and_a_lift_are_counted_as_such(tmp_path: Path) -> None:
-    env = load_policy(save_run(tmp_path)).make_env(2, "cpu", 1, posture.TASK)
+    env = load_policy(save_run(tmp_path)).make_env(2, "cpu", 1, ENDLESS)
     recorder = posture.PostureRecorder(env, 0, 4)
     contact, something = env.task_state.foot_contact, env.task_state.something_to_hit
     something.copy_(torch.tensor([True, False]))

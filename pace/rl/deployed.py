@@ -79,19 +79,14 @@ MEMORY_OUTPUTS = {
 KEPT = {"previous_action": "action", "ball_moved_away": "ball_moved_away_next", "return_memory": "return_memory_next"}
 
 
-def remembers(config: TaskConfig) -> bool:
-    """Whether the policy observes how its returns left the paddle."""
-    return "last_return" in config.observation.policy
-
-
 def input_ports(config: TaskConfig) -> dict[str, Port]:
     """The policy's inputs, in order."""
-    return INPUTS | MEMORY_INPUTS if remembers(config) else dict(INPUTS)
+    return INPUTS | MEMORY_INPUTS if config.observation.memory else dict(INPUTS)
 
 
 def output_ports(config: TaskConfig) -> dict[str, Port]:
     """The policy's outputs, in order."""
-    return OUTPUTS | MEMORY_OUTPUTS if remembers(config) else dict(OUTPUTS)
+    return OUTPUTS | MEMORY_OUTPUTS if config.observation.memory else dict(OUTPUTS)
 
 
 def kept_outputs(config: TaskConfig) -> dict[str, str]:
@@ -286,8 +281,8 @@ class DeployedPolicy(nn.Module):
         self.tracks = BallTracks(config)
         self.reader = PredictionReader(config, policy.predictor)
         self.chain = PaddleChain(model)
-        numbers = config.observation.return_memory
-        self.memory = ReturnMemoryStep(numbers, config.robot.control_dt) if numbers and remembers(config) else None
+        numbers = config.observation.memory
+        self.memory = ReturnMemoryStep(numbers, config.robot.control_dt) if numbers else None
         self.names = list(config.observation.policy)
         self.action_scale, self.action_clip = config.robot.action_scale, config.robot.action_clip
         self.register_buffer("nominal", torch.tensor(nominal_pose(config.robot), dtype=torch.float32))

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from pace.config import ReturnMemoryConfig
-from pace.rl.memory import GRAVITY
 from pace.rl.signal_kernels import AGE, BEFORE, NORMAL_1, POSITION_1, POSITION_2, RETURN
+from pace.sim.aero import GRAVITY
 
 
 class ReturnMemoryStep(nn.Module):

@@ -109,8 +109,7 @@ class TableTennisEnv(EnvBase):
         )
         rule, rules, action = reward.nothing_to_hit, self.game.rules, self.task_state.action
         signals = (self.sensing, worlds.kinematics, worlds.nominal, action)
-        memory = config.observation.return_memory if "last_return" in config.observation.policy else None
-        self.actor = ActorSignals(*signals, predictor, config.predictor, rule, rules, memory)
+        self.actor = ActorSignals(*signals, predictor, config.predictor, rule, rules, config.observation.memory)
 
     def _allocate(self) -> None:
         names, count, device = self.config.observation, self.num_worlds, self.worlds.device

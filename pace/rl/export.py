@@ -31,7 +31,7 @@ from torch import Tensor
 from pace.command import run_command
 from pace.config import ExportConfig, TrainConfig, parse, to_dict
 from pace.rl.checkpoint import CheckpointError
-from pace.rl.deployed import DeployedPolicy, input_ports, input_shapes, kept_outputs, output_ports, remembers
+from pace.rl.deployed import DeployedPolicy, input_ports, input_shapes, kept_outputs, output_ports
 from pace.rl.env import TableTennisEnv
 from pace.rl.loading import TaskPolicy, load_policy
 from pace.rl.observations import POLICY, layout
@@ -298,7 +298,7 @@ def expected_outputs(env: TableTennisEnv, policy: TaskPolicy, action: Tensor) ->
         "predicted_time": actor.time.unsqueeze(-1),
         "something_to_hit": actor.track.something_to_hit.float().unsqueeze(-1),
     }
-    if actor.memory is not None and remembers(policy.config):
+    if actor.memory is not None:
         outputs["return_memory_next"] = actor.memory.seen
     return outputs
 

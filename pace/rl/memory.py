@@ -14,8 +14,6 @@ from pace.sim.sharing import record, share
 
 #: Numbers that the actor sees: velocity of the last return 3, restitution above the prior 1, share of hits 1.
 SEEN = 5
-#: Standard gravity, m/s^2: takes the velocities before and after a hit to the time of the hit.
-GRAVITY = 9.81
 
 
 class ReturnMemory:
@@ -72,7 +70,7 @@ class ReturnMemory:
 def memory_rules(config: ReturnMemoryConfig, control_dt: float) -> MemoryRules:
     """The numbers in the kernel's form."""
     rules = MemoryRules()
-    rules.control_dt, rules.gravity = control_dt, GRAVITY
+    rules.control_dt = control_dt
     rules.prior, rules.prior_hits, rules.hits = config.prior, config.prior_hits, config.hits
     rules.reach, rules.closing_speed, rules.largest = config.reach, config.closing_speed, config.largest
     return rules

@@ -6,6 +6,7 @@ One thread a world. See :mod:`pace.rl.observations`.
 import warp as wp
 
 from pace.rl.task_kernels import LONGEST_TIME, Rules, clamp_x, nothing_to_hit
+from pace.sim.aero import GRAVITY
 
 
 @wp.func
@@ -125,7 +126,6 @@ class MemoryRules:
     """Numbers of :class:`pace.rl.memory.ReturnMemory`; m, s."""
 
     control_dt: float
-    gravity: float
     prior: float
     prior_hits: float
     hits: float
@@ -184,7 +184,7 @@ def remember_return(
     age = 0.0
     if turned[world]:
         age = wp.min(row[AGE] + 1.0, 4.0)
-    fall = wp.vec3(0.0, 0.0, 2.0 * rules.control_dt * rules.gravity)  # in the two steps to the hit, and from it
+    fall = wp.vec3(0.0, 0.0, 2.0 * rules.control_dt * GRAVITY)  # in the two steps to the hit, and from it
     span = 2.0 * rules.control_dt
     if age == 1.0:
         _keep(row, BEFORE, (_position(ball, newest - 6) - _position(ball, newest - 12)) / span - fall)

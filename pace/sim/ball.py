@@ -24,7 +24,7 @@ from pace.sim.ball_kernels import (
 )
 from pace.sim.flight import Scene
 from pace.sim.rebound import Material
-from pace.sim.sharing import record, share, share_all, torch_stream
+from pace.sim.sharing import record, share, share_all
 
 __all__ = ["FORECAST_HORIZON", "BallEvents", "BallParams", "BallSim", "Forecast", "ball_preset"]
 
@@ -269,37 +269,15 @@ class BallSim:
         self._ask = torch.zeros(3, num_worlds, 3, device=device)
         self._scene = _scene(table, self._path, control_dt / substeps)
         self._ball_dt = ball_dt
-        self._ahead: tuple[float | None, Callable[[Tensor], None] | None] = (None, None)
-        self._record()
+        self._ahead: dict[float, Callable[[Tensor], None]] = {}  # by intercept_x, from _ask
+        self._fly = self._record_flight()
 
-    def _record(self) -> None:
-        """Record the flight's launch, so that a call only replays it."""
-        device = wp.device_from_torch(self.device)
+    def _record_flight(self) -> Callable[[], None]:
+        """The flight along the present path, recorded so that a call only replays it."""
         ball = [share(self.position), share(self.velocity), share(self.spin)]
-        params = wp.from_torch(self._param_matrix)
-        self._fly_launch = wp.launch(
-            fly_step,
-            dim=self.num_worlds,
-            inputs=[
-                *ball,
-                params,
-                self._scene,
-                share_all(EventArrays, vars(self.events)),
-                share(self.nearest_paddle_distance),
-                self.control_dt,
-                self._ball_dt,
-            ],
-            device=device,
-            record_cmd=True,
-        )
-        self._forecast_inputs = [params, self._scene, share_all(ForecastArrays, vars(self.forecast_result))]
-
-    def _launch(self, launch: wp.Launch) -> None:
-        """Replay a launch on torch's current stream, so that it keeps its place among torch's own kernels."""
-        if self.device.type == "cuda":
-            launch.launch(stream=torch_stream(self.device))
-        else:
-            launch.launch()
+        events = [share_all(EventArrays, vars(self.events)), share(self.nearest_paddle_distance)]
+        inputs = [*ball, wp.from_torch(self._param_matrix), self._scene, *events, self.control_dt, self._ball_dt]
+        return record(fly_step, self.num_worlds, inputs, self.device)
 
     def fly(self, paddle_path: Tensor) -> None:
         """Fly one control step along ``paddle_path`` (N, S + 1, 12), world frame, S + 1 equidistant instants:
@@ -313,7 +291,7 @@ class BallSim:
         """
         if paddle_path is not self._path:
             self._bind_path(paddle_path)
-        self._launch(self._fly_launch)
+        self._fly()
 
     def _bind_path(self, path: Tensor) -> None:
         if path.shape != self._path_shape or path.dtype != torch.float32 or not path.is_contiguous():
@@ -323,7 +301,7 @@ class BallSim:
             )
         self._path = path
         self._scene.path = wp.from_torch(path)
-        self._fly_launch.set_param_by_name("scene", self._scene)
+        self._fly = self._record_flight()
 
     def forecast(self, mask: Tensor, position: Tensor, velocity: Tensor, spin: Tensor, intercept_x: float) -> None:
         """Look ahead from position, velocity and spin (N, 3) in the worlds of ``mask`` (N,) bool.
@@ -333,17 +311,18 @@ class BallSim:
         """
         for own, given in zip(self._ask, (position, velocity, spin), strict=True):
             own.copy_(given)
-        if self._ahead[0] != intercept_x:
-            self._ahead = (intercept_x, self.forecaster(self._ask[0], self._ask[1], self._ask[2], intercept_x))
-        assert self._ahead[1] is not None
-        self._ahead[1](mask)
+        if intercept_x not in self._ahead:
+            self._ahead[intercept_x] = self.forecaster(self._ask[0], self._ask[1], self._ask[2], intercept_x)
+        self._ahead[intercept_x](mask)
 
     def forecaster(
         self, position: Tensor, velocity: Tensor, spin: Tensor, intercept_x: float
     ) -> Callable[[Tensor], None]:
         """:meth:`forecast` of a mask, always from these tensors: it reads them where they lie, which saves copies."""
-        inputs = [share(self._ask_mask), share(position), share(velocity), share(spin), *self._forecast_inputs]
-        launch = record(forecast_flight, self.num_worlds, [*inputs, intercept_x, self._ball_dt], self.device)
+        start = [share(self._ask_mask), share(position), share(velocity), share(spin)]
+        result = share_all(ForecastArrays, vars(self.forecast_result))
+        inputs = [*start, wp.from_torch(self._param_matrix), self._scene, result, intercept_x, self._ball_dt]
+        launch = record(forecast_flight, self.num_worlds, inputs, self.device)
 
         def ahead(mask: Tensor) -> None:
             self._ask_mask.copy_(mask)

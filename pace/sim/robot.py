@@ -131,10 +131,11 @@ def _set_motors(spec: mujoco.MjSpec, robot: RobotConfig) -> None:
     for name, (kp, kd, effort) in zip(JOINT_NAMES, joint_gains(robot).T, strict=True):
         spec.joint(name).armature = robot.armature
         actuator = spec.actuator(name)
-        actuator.set_to_position(kp=kp, kv=kd)
-        actuator.forcerange = [-effort, effort]
         if robot.stall_ratio:
             _set_line(actuator, kp, kd, _group(robot, name).max_speed, robot.stall_ratio * effort)
+        else:
+            actuator.set_to_position(kp=kp, kv=kd)
+        actuator.forcerange = [-effort, effort]
 
 
 def _set_line(actuator: mujoco.MjsActuator, kp: float, kd: float, speed: float, stall: float) -> None:

@@ -16,12 +16,8 @@ from pace.rl.evaluation import COLUMNS, C, ServeRecorder, play, wilson
 from pace.rl.loading import TaskPolicy, load_policy
 from pace.rl.observations import POLICY, layout
 from pace.rl.outcome import Outcome
-from pace.studies.common import COLOURS, markdown
+from pace.studies.common import COLOURS, ENDLESS, markdown
 
-TASK = (
-    "reset=evaluation", "serve=mixed", "serve.serves_per_episode=0", "serve.end_after_hit=0", "randomization=wide",
-    "engine=native", "engine.threads=1", "engine.physics_dt=0.002",
-)  # fmt: skip
 HIT_SPEED = 6.0  # m/s along the normal, at which paddles are told apart
 #: Restitution at HIT_SPEED below which a paddle belongs to the group; randomization=wide goes from 0.38 to 0.87.
 GROUPS = {"dead": 0.54, "middling": 0.71, "lively": 1.0}
@@ -58,7 +54,7 @@ def adapt(run: Path, worlds: int, forgetful: bool = False) -> Adaptation:
     ``forgetful``: with the memory blanked (of a policy that has ``last_return``).
     """
     policy = load_policy(run)
-    env = policy.make_env(worlds, "cpu", SEED, TASK)
+    env = policy.make_env(worlds, "cpu", SEED, [*ENDLESS, "randomization=wide"])
     restitution = _restitution(env)
     recorder = ServeRecorder(env, 0, SERVES)
     play(env, Forgetful(policy) if forgetful else policy, recorder)  # type: ignore[arg-type]  # only called
@@ -79,8 +75,8 @@ def adaptations(runs: Sequence[Path], worlds: int) -> list[Adaptation]:
     """Every policy, and those with a memory without it too."""
     found = []
     for run in runs:
-        remembers = "last_return" in load_policy(run).config.observation.policy
-        for forgetful in (False, True) if remembers else (False,):
+        memory = load_policy(run).config.observation.memory
+        for forgetful in (False, True) if memory else (False,):
             found.append(adapt(run, worlds, forgetful))
             print(f"{found[-1].policy}: done", flush=True)
     return found

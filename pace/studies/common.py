@@ -17,6 +17,11 @@ from pace.sim.robot import JOINT_NAMES, build_model
 
 Array = NDArray[np.float64]
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")  # told apart by all kinds of vision
+#: The task of a saved policy that is watched: mixed serves without end, from the paper's reset, at 2 ms on one thread.
+ENDLESS = (
+    "reset=evaluation", "serve=mixed", "serve.serves_per_episode=0", "serve.end_after_hit=0",
+    "engine=native", "engine.threads=1", "engine.physics_dt=0.002",
+)  # fmt: skip
 #: Columns of the joints that carry the paddle: waist and right arm.
 ARM = [i for i, name in enumerate(JOINT_NAMES) if name == "Waist" or name.startswith(("Right_Sh", "Right_El"))]
 

@@ -20,7 +20,7 @@ from pace.rl.evaluation import ServeRecorder, play, summarise
 from pace.rl.loading import TaskPolicy, load_policy
 from pace.sim.engine_native import stop_timers
 from pace.sim.robot import JOINT_NAMES, motor_lines
-from pace.studies.common import Array, markdown, model_of, study_config
+from pace.studies.common import ENDLESS, Array, markdown, model_of, study_config
 
 ROBOT = "robot=t1"  # the limit is of configs/, not of a policy that was trained before it
 WITHOUT, WITH = "without", "with"
@@ -74,9 +74,7 @@ class Use:
 
 def use(policy: TaskPolicy, case: str, worlds: int, serves: int) -> Use:
     """Play ``serves`` mixed serves of the saved task, counted after each world's first, 2 ms a physics step."""
-    task = ["reset=evaluation", "serve=mixed", "serve.serves_per_episode=0", "serve.end_after_hit=0"]
-    engine = ["engine=native", "engine.threads=1", "engine.physics_dt=0.002"]
-    env = policy.make_env(worlds, "cpu", SEED, [*task, *engine, *CASES[case]])
+    env = policy.make_env(worlds, "cpu", SEED, [*ENDLESS, *CASES[case]])
     lines = motor_lines(load_train_config().robot)
     if lines is None:
         raise ConfigError("configs/robot/t1.yaml has no stall_ratio: there is no line to compare with")

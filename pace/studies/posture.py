@@ -14,12 +14,8 @@ from pace.rl.env import TableTennisEnv
 from pace.rl.evaluation import ServeRecorder, play
 from pace.rl.loading import TaskPolicy, load_policy
 from pace.sim.robot import CONTACT_BODIES
-from pace.studies.common import markdown
+from pace.studies.common import ENDLESS, markdown
 
-TASK = (
-    "reset=evaluation", "serve=mixed", "serve.serves_per_episode=0", "serve.end_after_hit=0",
-    "engine=native", "engine.threads=1", "engine.physics_dt=0.002",
-)  # fmt: skip
 SEED = 7
 #: Phases of play: a ball that can be hit is in the air, or none.
 AT_BALL, WAITING = "at the ball", "waiting"
@@ -81,7 +77,7 @@ class Posture:
 
 def posture(policy: TaskPolicy, name: str, worlds: int, serves: int) -> Posture:
     """Play ``serves`` mixed serves of the saved task, 2 ms a physics step."""
-    env = policy.make_env(worlds, "cpu", SEED, TASK)
+    env = policy.make_env(worlds, "cpu", SEED, ENDLESS)
     recorder = PostureRecorder(env, 1, math.ceil(serves / worlds))
     play(env, policy, recorder)
     total = recorder.instants.sum()

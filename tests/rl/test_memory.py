@@ -9,8 +9,9 @@ from torch import Tensor
 from pace.config import ConfigError, ReturnMemoryConfig
 from pace.rl.deployed_memory import ReturnMemoryStep
 from pace.rl.env import make_env
-from pace.rl.memory import GRAVITY, SEEN, ReturnMemory
+from pace.rl.memory import SEEN, ReturnMemory
 from pace.rl.observations import check_policy
+from pace.sim.aero import GRAVITY
 from tests.rl.fakes import config
 
 DT = 0.02
