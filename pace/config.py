@@ -241,9 +241,15 @@ class SensingConfig:
     heading: float
     base_shift: float  # m
     mocap_delay: Range  # s, drawn per world at reset: ball, base position and heading
+    noise_scale: Range = field(default_factory=lambda: [1.0, 1.0])  # of all amplitudes, drawn per world at reset
+    moved: float = (
+        0.03  # m; a ball seen this much further away than two control steps before has turned: no noise does that
+    )
 
     def __post_init__(self) -> None:
         _check_range("sensing.mocap_delay", self.mocap_delay, lowest=0.0)
+        _check_range("sensing.noise_scale", self.noise_scale, lowest=0.0)
+        _require(self.moved >= 0, f"sensing.moved must not be negative, got {self.moved}")
 
 
 @dataclass
@@ -265,6 +271,23 @@ class ReturnMemoryConfig:
 
 
 @dataclass
+class DelayEstimateConfig:
+    """How the robot finds out how late its motion capture is (:class:`pace.rl.delay.DelayEstimate`)."""
+
+    prior: float  # s, before anything was seen
+    prior_worth: float  # rad^2/s^2, sum of squared changes of the yaw rate that the prior is worth
+    smoothing: float  # share of the filtered turns that is left a control step later
+    fading: float  # share of the sums that is left a control step later
+
+    def __post_init__(self) -> None:
+        _require(self.prior >= 0, f"observation.delay_estimate.prior must not be negative, got {self.prior}")
+        _require(self.prior_worth > 0, "observation.delay_estimate.prior_worth must be positive")
+        for name in ("smoothing", "fading"):
+            value = getattr(self, name)
+            _require(0 < value <= 1, f"observation.delay_estimate.{name} must lie in (0, 1], got {value}")
+
+
+@dataclass
 class ObservationConfig:
     """Names of the observations of each network, in order, and how many control steps of history each sees."""
 
@@ -274,11 +297,17 @@ class ObservationConfig:
     policy_history: int
     critic_history: int
     return_memory: ReturnMemoryConfig | None = None  # needed by the observation last_return
+    delay_estimate: DelayEstimateConfig | None = None  # needed by the observation sensed_delay
 
     @property
     def memory(self) -> ReturnMemoryConfig | None:
         """Numbers of the memory of returns, where the policy observes it."""
         return self.return_memory if "last_return" in self.policy else None
+
+    @property
+    def delay(self) -> DelayEstimateConfig | None:
+        """Numbers of the estimate of the delay, where the policy observes it."""
+        return self.delay_estimate if "sensed_delay" in self.policy else None
 
     def __post_init__(self) -> None:
         _require(self.policy_history >= 1, "observation.policy_history must be at least 1")
@@ -437,6 +466,8 @@ class TrainConfig(TaskConfig):
     checkpoint_minutes: float
     tensorboard: bool
     progress: bool
+    # a run folder or checkpoint whose predictor to start from, instead of that of init_from
+    predictor_from: str | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         _require(self.num_worlds >= 1, f"num_worlds must be at least 1, got {self.num_worlds}")
@@ -448,6 +479,7 @@ class TrainConfig(TaskConfig):
         _require(self.samples > 0, "samples must be positive")
         _require(self.minutes >= 0, f"minutes must not be negative (0: no limit), got {self.minutes}")
         _require(not (self.resume and self.init_from), "give resume or init_from, not both")
+        _require(not (self.resume and self.predictor_from), "give resume or predictor_from, not both")
 
 
 @dataclass

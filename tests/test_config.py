@@ -132,6 +132,7 @@ def test_missing_key_is_named(key: str) -> None:
         ("minutes=-1", "minutes must not be negative"),
         ("sensing.mocap_delay=[0.01,0.004]", "sensing.mocap_delay: low 0.01 is above high 0.004"),
         ("sensing.mocap_delay=[-0.01,0.0]", "sensing.mocap_delay: -0.01 is below 0.0"),
+        ("sensing.noise_scale=[2.0,1.0]", "sensing.noise_scale: low 2.0 is above high 1.0"),
         ("~reward.nothing_to_hit.low_z", "reward.nothing_to_hit needs exactly falling_x, low_z, past_x"),
         ("reward.target_mode=apex", "reward.target_mode must be intercept or clamp"),
         ("observation.policy_history=0", "observation.policy_history must be at least 1"),

@@ -72,7 +72,7 @@ class ServePractice:
         self._randomizer = self._make_randomizer()
         self._serves = ServeSampler(config.serve, count, self.generator, device)
         self._game = Game(config, self.ball, torch.tensor(STANDING, device=device).repeat(count, 1))
-        self._track = BallTrack(config.predictor.frames, config.reward.nothing_to_hit, count, device)
+        self._track = BallTrack(config.predictor.frames, self._game.rules, count, device)
         self._path = torch.full((count, 2, 12), FAR_AWAY, device=device)
         self._path[:, :, 3:] = torch.tensor([1.0, *[0.0] * 8], device=device)  # a unit normal, at rest
         still = {name: torch.zeros(count, size, device=device) for name, size in STILL_ROBOT.items()}

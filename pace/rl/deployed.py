@@ -16,12 +16,12 @@ from torch import Tensor, nn
 
 from pace.config import TaskConfig
 from pace.predictor.network import PredictorNetwork
-from pace.rl.deployed_memory import ReturnMemoryStep
+from pace.rl.deployed_memory import DelayEstimateStep, ReturnMemoryStep
 from pace.rl.loading import TaskPolicy
 from pace.rl.memory import SEEN
 from pace.rl.observations import JOINTS, check_policy
 from pace.rl.policy import Policy
-from pace.rl.signal_kernels import MEMORY_SIZE
+from pace.rl.signal_kernels import DELAY_SIZE, MEMORY_SIZE
 from pace.rl.task import idle_point
 from pace.rl.task_kernels import LONGEST_TIME
 from pace.sim.robot import TRUNK_BODY, nominal_pose
@@ -75,18 +75,38 @@ MEMORY_OUTPUTS = {
         "of paddle and ball above the prior, share of hits that it is known from",
     ),
 }
+#: Inputs and outputs besides, of a policy that observes ``sensed_delay``.
+DELAY_INPUTS = {
+    "delay_estimate": Port(
+        DELAY_SIZE, "rad, rad/s, s", "the output delay_estimate_next of the calls before; zeros before the first one"
+    ),
+}
+DELAY_OUTPUTS = {
+    "delay_estimate_next": Port(
+        DELAY_SIZE,
+        "rad, rad/s, s",
+        "kept by the caller as delay_estimate of the next call; the last: delay of motion capture above the prior",
+    ),
+}
 #: Input -> the output of the calls before that it is made of. An ONNX graph has one name space, hence the other names.
-KEPT = {"previous_action": "action", "ball_moved_away": "ball_moved_away_next", "return_memory": "return_memory_next"}
+KEPT = {
+    "previous_action": "action",
+    "ball_moved_away": "ball_moved_away_next",
+    "return_memory": "return_memory_next",
+    "delay_estimate": "delay_estimate_next",
+}
 
 
 def input_ports(config: TaskConfig) -> dict[str, Port]:
     """The policy's inputs, in order."""
-    return INPUTS | MEMORY_INPUTS if config.observation.memory else dict(INPUTS)
+    observation = config.observation
+    return INPUTS | (MEMORY_INPUTS if observation.memory else {}) | (DELAY_INPUTS if observation.delay else {})
 
 
 def output_ports(config: TaskConfig) -> dict[str, Port]:
     """The policy's outputs, in order."""
-    return OUTPUTS | MEMORY_OUTPUTS if config.observation.memory else dict(OUTPUTS)
+    observation = config.observation
+    return OUTPUTS | (MEMORY_OUTPUTS if observation.memory else {}) | (DELAY_OUTPUTS if observation.delay else {})
 
 
 def kept_outputs(config: TaskConfig) -> dict[str, str]:
@@ -184,6 +204,7 @@ class BallTracks(nn.Module):
         super().__init__()
         self.frames = config.predictor.frames
         self.rule = dict(config.reward.nothing_to_hit)
+        self.moved = config.sensing.moved
 
     def forward(self, position: Tensor, launched: Tensor, moved_away: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Positions (N, L, 3) m, flags (N, L, 1) and (N, 1, 1) -> tracks (N, H, 3 frames), something to hit (N, H)
@@ -199,7 +220,7 @@ class BallTracks(nn.Module):
             if frame < self.frames - 1:
                 continue
             change = track[:, -1] - track[:, -3]
-            gone = (change[:, :1] > 0.0) | (gone & ~new)
+            gone = (change[:, :1] > self.moved) | (gone & ~new)
             tracks.append(track.flatten(1))
             hittable.append(~(gone | self._nothing_to_hit(track[:, -1], change)))
             bits.append(gone)
@@ -207,7 +228,7 @@ class BallTracks(nn.Module):
 
     def _nothing_to_hit(self, position: Tensor, change: Tensor) -> Tensor:
         x, z = position[:, :1], position[:, 2:]
-        gone = (x < self.rule["past_x"]) | (change[:, :1] > 0.0) | (z < self.rule["low_z"])
+        gone = (x < self.rule["past_x"]) | (change[:, :1] > self.moved) | (z < self.rule["low_z"])
         return gone | ((x < self.rule["falling_x"]) & (change[:, 2:] < 0.0))
 
 
@@ -283,6 +304,8 @@ class DeployedPolicy(nn.Module):
         self.chain = PaddleChain(model)
         numbers = config.observation.memory
         self.memory = ReturnMemoryStep(numbers, config.robot.control_dt) if numbers else None
+        numbers = config.observation.delay
+        self.delay = DelayEstimateStep(numbers, config.robot.control_dt) if numbers else None
         self.names = list(config.observation.policy)
         self.action_scale, self.action_clip = config.robot.action_scale, config.robot.action_clip
         self.register_buffer("nominal", torch.tensor(nominal_pose(config.robot), dtype=torch.float32))
@@ -301,9 +324,9 @@ class DeployedPolicy(nn.Module):
         ball_position: Tensor,
         ball_launched: Tensor,
         ball_moved_away: Tensor,
-        return_memory: Tensor | None = None,
+        *kept: Tensor,
     ) -> tuple[Tensor, ...]:
-        """See the class."""
+        """See the class; ``kept``: what is remembered, where the policy observes it."""
         tracks, hittable, moved_away = self.tracks(ball_position, ball_launched, ball_moved_away)
         prediction = self.reader(tracks, hittable, base_position)
         rotation = base_rotation(projected_gravity, heading)
@@ -324,13 +347,25 @@ class DeployedPolicy(nn.Module):
             "predicted_time": prediction.time,
             "something_to_hit": hittable.unsqueeze(-1).float(),
         }
-        kept: tuple[Tensor, ...] = ()
-        if self.memory is not None and return_memory is not None:
-            kept = (self.memory(return_memory[:, -1], tracks[:, -1], moved_away[:, -1:], paddle[:, -1], normal[:, -1]),)
-            # each was the newest one of its call, so those kept are the frames before the present one, and one too old
-            frames["last_return"] = torch.cat((return_memory[:, 1:], kept[0].unsqueeze(1)), dim=1)[..., -SEEN:]
+        kept_next: list[Tensor] = []
+        waiting = list(kept)
+        if self.memory is not None:
+            past = waiting.pop(0)
+            new = self.memory(past[:, -1], tracks[:, -1], moved_away[:, -1:], paddle[:, -1], normal[:, -1])
+            frames["last_return"] = _with_newest(past, new)[..., -SEEN:]
+            kept_next.append(new)
+        if self.delay is not None:
+            past = waiting.pop(0)
+            new = self.delay(past[:, -1], base_angular_velocity[:, -1], projected_gravity[:, -1], heading[:, -1])
+            frames["sensed_delay"] = _with_newest(past, new)[..., -1:]
+            kept_next.append(new)
         observation = torch.cat([frames[name] for name in self.names], dim=-1).flatten(1)
         action = self.policy(observation).clamp(-self.action_clip, self.action_clip)
         seen = (prediction.apex[:, -1], prediction.target[:, -1], prediction.time[:, -1])
         flags = (hittable[:, -1:].float(), moved_away[:, :1].float())  # the next history begins one frame later
-        return self.nominal + self.action_scale * action, action, *seen, *flags, *kept
+        return self.nominal + self.action_scale * action, action, *seen, *flags, *kept_next
+
+
+def _with_newest(past: Tensor, newest: Tensor) -> Tensor:
+    """What was kept (N, frames, size), each the newest of its call, and this call's; the oldest is dropped."""
+    return torch.cat((past[:, 1:], newest.unsqueeze(1)), dim=1)

@@ -1,12 +1,14 @@
-"""The memory of returns (:mod:`pace.rl.memory`) in torch, so that it can be part of an exported policy."""
+"""What a robot keeps over an episode (:mod:`pace.rl.memory`, :mod:`pace.rl.delay`), in torch, for exported policies."""
 
 from __future__ import annotations
+
+import math
 
 import torch
 from torch import Tensor, nn
 
-from pace.config import ReturnMemoryConfig
-from pace.rl.signal_kernels import AGE, BEFORE, NORMAL_1, POSITION_1, POSITION_2, RETURN
+from pace.config import DelayEstimateConfig, ReturnMemoryConfig
+from pace.rl.signal_kernels import AGE, BEFORE, NORMAL_1, POSITION_1, POSITION_2, RETURN, SMALLEST_TILT
 from pace.sim.aero import GRAVITY
 
 
@@ -61,3 +63,36 @@ class ReturnMemoryStep(nn.Module):
         mean = (restitution * weight + estimate - config.prior) / (weight + 1.0)
         learned = torch.cat((mean, (hits + 1.0) / config.hits), dim=1)
         return torch.cat((after, torch.where(fast, learned, seen[:, 3:])), dim=1)
+
+
+class DelayEstimateStep(nn.Module):
+    """One control step of the estimate, as the kernel :func:`pace.rl.signal_kernels.estimate_delay` computes it.
+
+    Args: config: numbers of the estimate; control_dt: s.
+    """
+
+    def __init__(self, config: DelayEstimateConfig, control_dt: float) -> None:
+        super().__init__()
+        self.config, self.control_dt = config, control_dt
+
+    def forward(self, kept: Tensor, angular_velocity: Tensor, gravity: Tensor, heading: Tensor) -> Tensor:
+        """What is kept (N, 8) after this step.
+
+        Args: kept (N, 8) before it, zeros at first; angular_velocity (N, 3) rad/s and gravity (N, 3), body frame;
+        heading (N, 2).
+        """
+        config = self.config
+        known, last_yaw, last_rate, behind, change, products, squares, _ = kept.split(1, dim=1)
+        tilt = gravity[:, 1:].square().sum(1, keepdim=True).clamp(min=SMALLEST_TILT)
+        rate = -(gravity[:, 1:] * angular_velocity[:, 1:]).sum(1, keepdim=True) / tilt
+        yaw = torch.atan2(heading[:, 1:], heading[:, :1])
+        turn = yaw - last_yaw
+        turn = turn - 2.0 * math.pi * torch.round(turn / (2.0 * math.pi))
+        said = 0.5 * self.control_dt * (rate + last_rate)
+        behind = config.smoothing * behind + said - turn
+        change = config.smoothing * change + rate - last_rate
+        products = config.fading * products + change * behind
+        squares = config.fading * squares + change.square()
+        estimate = (products - config.prior * squares) / (squares + config.prior_worth)
+        learned = known * torch.cat((behind, change, products, squares, estimate), dim=1)  # zeros at first
+        return torch.cat((torch.ones_like(known), yaw, rate, learned), dim=1)

@@ -98,18 +98,17 @@ class TableTennisEnv(EnvBase):
             config.reset, config.robot, self.num_worlds, worlds.nominal, limits, worlds.joint_names, self.generator
         )
         self.game = Game(config, worlds.ball, worlds.robot.base_position)
-        self.task_state = TaskState(worlds, self.game)
+        self.sensing = Sensing(
+            config.sensing, self.num_worlds, device, worlds.control_dt, worlds.nominal, self.generator
+        )
+        self.task_state = TaskState(worlds, self.game, self.sensing.delay)
         ball, events = worlds.ball, worlds.ball.events
         struck = (events.hit_position, events.hit_velocity_out, events.hit_spin_out)
         self._forecast_return = ball.forecaster(*struck, reward.target_x)
         self._forecast_serve = ball.forecaster(ball.position, ball.velocity, ball.spin, reward.target_x)
         self.rewards = RewardManager(reward, self.num_worlds, device, worlds.control_dt)
-        self.sensing = Sensing(
-            config.sensing, self.num_worlds, device, worlds.control_dt, worlds.nominal, self.generator
-        )
-        rule, rules, action = reward.nothing_to_hit, self.game.rules, self.task_state.action
-        signals = (self.sensing, worlds.kinematics, worlds.nominal, action)
-        self.actor = ActorSignals(*signals, predictor, config.predictor, rule, rules, config.observation.memory)
+        signals = (self.sensing, worlds.kinematics, worlds.nominal, self.task_state.action)
+        self.actor = ActorSignals(*signals, predictor, config.predictor, self.game.rules, config.observation)
 
     def _allocate(self) -> None:
         names, count, device = self.config.observation, self.num_worlds, self.worlds.device
@@ -177,8 +176,7 @@ class TableTennisEnv(EnvBase):
         self.sensing.update(self.worlds.robot, self.worlds.ball.position, next_serve)
         self.actor.track.update(self.sensing.ball_position, next_serve)
         self._compute_signals()
-        if self.actor.memory is not None:
-            self.actor.memory.update()
+        self.actor.remember()
         self._policy_history.push()
         self._critic_history.push()
         self._flag_bad()
@@ -203,8 +201,7 @@ class TableTennisEnv(EnvBase):
         self.sensing.reset(mask, self.worlds.robot, self.worlds.ball.position)
         self.actor.track.restart(mask, self.sensing.ball_position)
         self._compute_signals(mask)
-        if self.actor.memory is not None:
-            self.actor.memory.restart(mask)
+        self.actor.forget(mask)
         self._policy_history.fill(mask)
         self._critic_history.fill(mask)
 
@@ -269,8 +266,8 @@ class TableTennisEnv(EnvBase):
         return sums | {f"reward/{name}": value for name, value in terms.items()}
 
     def _parts(self) -> dict[str, object]:
-        memory: dict[str, object] = {} if self.actor.memory is None else {"memory": self.actor.memory}
-        return memory | {
+        kept = {"memory": self.actor.memory, "delay": self.actor.delay}
+        return {name: part for name, part in kept.items() if part is not None} | {
             "state": self.task_state,
             "sensing": self.sensing,
             "track": self.actor.track,

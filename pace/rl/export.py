@@ -300,6 +300,8 @@ def expected_outputs(env: TableTennisEnv, policy: TaskPolicy, action: Tensor) ->
     }
     if actor.memory is not None:
         outputs["return_memory_next"] = actor.memory.seen
+    if actor.delay is not None:
+        outputs["delay_estimate_next"] = actor.delay.state
     return outputs
 
 

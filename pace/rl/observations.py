@@ -19,6 +19,7 @@ from torch import Tensor
 
 from pace.config import ConfigError, ObservationConfig, PredictorConfig, ReturnMemoryConfig
 from pace.predictor.network import OUTPUT_SIZES, predictor_slices
+from pace.rl.delay import DelayEstimate
 from pace.rl.memory import SEEN, ReturnMemory
 from pace.rl.signal_kernels import PredictionLayout, SignalArrays, fill_frames, follow_ball, read_prediction
 from pace.rl.state import TaskState
@@ -50,12 +51,10 @@ class BallTrack:
     launched; ``something_to_hit`` (N,) bool, as far as the robot can know.
     """
 
-    def __init__(self, frames: int, rule: Mapping[str, float], num_worlds: int, device: torch.device) -> None:
+    def __init__(self, frames: int, rules: Rules, num_worlds: int, device: torch.device) -> None:
         if frames < 3:
             raise ConfigError(f"predictor.frames must be at least 3, got {frames}: the ball's velocity is seen over 3")
-        self._rules = Rules()
-        for name, value in rule.items():
-            setattr(self._rules, name, value)
+        self._rules = rules
         self.positions = torch.zeros(num_worlds, 3 * frames, device=device)
         self.turned = torch.zeros(num_worlds, dtype=torch.bool, device=device)
         self.something_to_hit = torch.zeros(num_worlds, dtype=torch.bool, device=device)
@@ -95,7 +94,7 @@ class ActorSignals:
     Attributes, besides ``sensing`` and ``track``: ``action`` (N, J) the previous action, ``apex``, ``target``
     (N, 3) m predicted, ``time`` (N,) s until the ball is at the target, ``shift`` (N, 2) m from the sensed base to
     where it should stand, ``paddle_position`` (N, 3) m, ``paddle_normal`` (N, 3), ``prediction`` (N, P) raw output;
-    ``memory`` of its returns, which its owner updates.
+    ``memory`` of its returns and ``delay`` of its motion capture, or ``None``: see :meth:`remember`.
 
     Args:
         sensing: the robot's sensors.
@@ -104,9 +103,8 @@ class ActorSignals:
         action: (N, J) the robot's own last action, kept up to date by its owner.
         predictor: callable (N, 3 * frames) -> (N, P), or ``None``.
         config: which outputs the predictor has, and whether it is used.
-        rule: numbers of ``reward.nothing_to_hit``.
-        rules: where to stand, in the kernels' form.
-        memory: numbers of the memory of returns, or ``None`` without one.
+        rules: where to stand and what can be hit, in the kernels' form.
+        observation: numbers of what is remembered over an episode, where the policy observes it.
     """
 
     def __init__(
@@ -117,13 +115,12 @@ class ActorSignals:
         action: Tensor,
         predictor: Predictor | None,
         config: PredictorConfig,
-        rule: Mapping[str, float],
         rules: Rules,
-        memory: ReturnMemoryConfig | None = None,
+        observation: ObservationConfig | None = None,
     ) -> None:
         num_worlds, device = action.shape[0], action.device
         self.sensing, self.action = sensing, action
-        self.track = BallTrack(config.frames, rule, num_worlds, device)
+        self.track = BallTrack(config.frames, rules, num_worlds, device)
         self.predictor = predictor if config.enabled else None
         self._kinematics, self._nominal = kinematics, nominal
         self._joints = torch.zeros_like(action)
@@ -134,7 +131,9 @@ class ActorSignals:
         self.paddle_position = torch.zeros(num_worlds, 3, device=device)
         self.paddle_normal = torch.zeros(num_worlds, 3, device=device)
         self._read = self._record(predictor_slices(config.outputs), rules)
-        self.memory = self._remember(memory, rules.control_dt) if memory else None
+        memory, delay = (observation.memory, observation.delay) if observation else (None, None)
+        self.memory = self._make_memory(memory, rules.control_dt) if memory else None
+        self.delay = DelayEstimate(delay, rules.control_dt, sensing) if delay else None
 
     def _record(self, slices: dict[str, slice], rules: Rules) -> Callable[[], None]:
         columns = PredictionLayout()
@@ -148,9 +147,21 @@ class ActorSignals:
         inputs = [wp.from_torch(self.prediction), columns, *seen, rules, *results]
         return record(read_prediction, self.action.shape[0], inputs, self.action.device)
 
-    def _remember(self, config: ReturnMemoryConfig, control_dt: float) -> ReturnMemory:
+    def _make_memory(self, config: ReturnMemoryConfig, control_dt: float) -> ReturnMemory:
         track = self.track
         return ReturnMemory(config, control_dt, track.positions, track.turned, self.paddle_position, self.paddle_normal)
+
+    def remember(self) -> None:
+        """One control step later, after :meth:`compute`: what is kept over an episode."""
+        for kept in (self.memory, self.delay):
+            if kept is not None:
+                kept.update()
+
+    def forget(self, mask: Tensor) -> None:
+        """New episodes, in the worlds of ``mask`` (N,) bool, after :meth:`compute`."""
+        for kept in (self.memory, self.delay):
+            if kept is not None:
+                kept.restart(mask)
 
     def compute(self, changed: Tensor | None = None) -> None:
         """Everything that follows from the current ``sensing``, ``track`` and ``action``.
@@ -194,6 +205,11 @@ def _last_return(signals: ActorSignals) -> Tensor:
     return signals.memory.seen
 
 
+def _sensed_delay(signals: ActorSignals) -> Tensor:
+    assert signals.delay is not None  # check_policy has seen to it
+    return signals.delay.seen
+
+
 def _column(values: Tensor) -> Tensor:
     return values.unsqueeze(-1)
 
@@ -215,6 +231,7 @@ POLICY: dict[str, ActorObservation] = {
     "predicted_time": ActorObservation(1, lambda s: _column(s.time)),
     "something_to_hit": ActorObservation(1, lambda s: _column(s.track.something_to_hit)),
     "last_return": ActorObservation(SEEN, _last_return),
+    "sensed_delay": ActorObservation(1, _sensed_delay),
 }
 
 #: What the critic can see: the truth.
@@ -244,6 +261,7 @@ CRITIC: dict[str, CriticObservation] = {
     # of each world: the restitution is that at speed zero
     "paddle_restitution": CriticObservation(1, lambda s: _column(torch.as_tensor(s.ball.params.paddle_restitution))),
     "paddle_friction": CriticObservation(1, lambda s: _column(torch.as_tensor(s.ball.params.paddle_friction))),
+    "mocap_delay": CriticObservation(1, lambda s: _column(s.mocap_delay)),
 }
 
 Table = Mapping[str, ActorObservation] | Mapping[str, CriticObservation]
@@ -260,6 +278,8 @@ def check_policy(observation: ObservationConfig, predictor: PredictorConfig) -> 
             )
         if predictor.frames < 5:
             raise ConfigError(f"observation 'last_return' needs predictor.frames of 5 or more, got {predictor.frames}")
+    if "sensed_delay" in names and observation.delay_estimate is None:
+        raise ConfigError("observation.policy has 'sensed_delay': give observation.delay_estimate (observation=memory)")
     if "predicted_time" in names and predictor.enabled and "target_time" not in predictor.outputs:
         raise ConfigError("observation.policy has 'predicted_time': add 'target_time' to predictor.outputs")
 

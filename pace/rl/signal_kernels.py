@@ -8,6 +8,9 @@ import warp as wp
 from pace.rl.task_kernels import LONGEST_TIME, Rules, clamp_x, nothing_to_hit
 from pace.sim.aero import GRAVITY
 
+#: Squared horizontal part of gravity, in the body frame, at which the x axis points up or down and has no heading.
+SMALLEST_TILT = wp.constant(1.0e-3)
+
 
 @wp.func
 def _position(positions: wp.array[wp.float32], start: int) -> wp.vec3:
@@ -37,8 +40,9 @@ def follow_ball(
             row[i] = row[i + 3]
     for i in range(3):
         row[newest + i] = sensed[world][i]
-    # over two steps: noise matters less; only its sign is used
+    # over two steps: noise matters less. A ball that is seen late stands still at first, but for the noise
     change = _position(row, newest) - _position(row, newest - 6)
+    change[0] -= rules.moved
     gone = change[0] > 0.0 or (turned[world] and not mask[world])
     turned[world] = gone
     something_to_hit[world] = not (gone or nothing_to_hit(_position(row, newest), change, rules))
@@ -200,3 +204,61 @@ def remember_return(
     _keep(row, POSITION_2, _position(row, POSITION_1))
     _keep(row, POSITION_1, paddle)
     _keep(row, NORMAL_1, paddle_normal[world])
+
+
+@wp.struct
+class DelayRules:
+    """Numbers of :class:`pace.rl.delay.DelayEstimate`; s, rad^2/s^2."""
+
+    control_dt: float
+    prior: float
+    prior_worth: float
+    smoothing: float
+    fading: float
+
+
+#: Columns of a world's estimate of the delay: 1 once anything was seen; yaw (rad) and yaw rate (rad/s) one step ago;
+#: filtered: how far the yaw is behind what the rate says (rad), and the change of the rate (rad/s); the sums of their
+#: products and of the change's squares; the estimate above the prior (s).
+KNOWN, YAW, RATE, BEHIND = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(3)
+CHANGE, PRODUCTS, SQUARES, ESTIMATE = wp.constant(4), wp.constant(5), wp.constant(6), wp.constant(7)
+DELAY_SIZE = 8
+
+
+@wp.kernel
+def estimate_delay(
+    mask: wp.array[wp.bool],
+    restart: int,
+    angular_velocity: wp.array[wp.vec3],
+    gravity: wp.array[wp.vec3],
+    heading: wp.array2d[wp.float32],
+    rules: DelayRules,
+    estimate: wp.array2d[wp.float32],
+):
+    """One control step of a world's estimate; with ``restart`` the masked worlds begin anew, and the others wait.
+
+    :class:`pace.rl.deployed_memory.DelayEstimateStep` does the same in an exported policy.
+    """
+    world = wp.tid()
+    row = estimate[world]
+    if restart == 1:
+        if not mask[world]:
+            return
+        for column in range(row.shape[0]):
+            row[column] = 0.0
+    down, turning = gravity[world], angular_velocity[world]
+    # of the trunk's x axis on the ground: rotation about it does not turn it
+    rate = -(down[1] * turning[1] + down[2] * turning[2]) / wp.max(down[1] * down[1] + down[2] * down[2], SMALLEST_TILT)
+    yaw = wp.atan2(heading[world, 1], heading[world, 0])
+    if row[KNOWN] == 1.0:
+        turn = yaw - row[YAW]
+        turn -= 2.0 * wp.pi * wp.round(turn / (2.0 * wp.pi))
+        said = 0.5 * rules.control_dt * (rate + row[RATE])
+        row[BEHIND] = rules.smoothing * row[BEHIND] + said - turn
+        row[CHANGE] = rules.smoothing * row[CHANGE] + rate - row[RATE]
+        row[PRODUCTS] = rules.fading * row[PRODUCTS] + row[CHANGE] * row[BEHIND]
+        row[SQUARES] = rules.fading * row[SQUARES] + row[CHANGE] * row[CHANGE]
+        row[ESTIMATE] = (row[PRODUCTS] - rules.prior * row[SQUARES]) / (row[SQUARES] + rules.prior_worth)
+    row[KNOWN] = 1.0
+    row[YAW] = yaw
+    row[RATE] = rate

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import torch
 import warp as wp
+from torch import Tensor
 
 from pace.rl.reward_kernels import JointArrays, Measures, RobotArrays, measure
 from pace.rl.task import Game
@@ -40,8 +41,8 @@ class TaskState:
     """True state of the task after a control step. Privileged: the actor never reads it.
 
     Attributes: ``robot``, ``ball`` (simulation), ``game`` (rules and forecast), ``action`` and ``previous_action``
-    (N, J); ``nominal`` (J,) rad, ``joint_range`` the middle of the joints' ranges and the way from there to their ends,
-    (J,) rad each.
+    (N, J); ``mocap_delay`` (N,) control steps by which motion capture is late; ``nominal`` (J,) rad, ``joint_range``
+    the middle of the joints' ranges and the way from there to their ends, (J,) rad each.
     After :meth:`refresh`: ``measures`` name -> (N,) as its kernel computes them: ``joint_power`` and ``ankle_power`` W,
     norms over the joints of torque times velocity; ``joint_acceleration`` (rad/s^2)^2 and ``action_change``, sums of
     squares; the sum of |joint - nominal| over each other group of :data:`JOINT_GROUPS`, rad; ``foot_tilt``, squared
@@ -59,7 +60,7 @@ class TaskState:
     (N,), share of the episode's serves, 0 where episodes do not end.
     """
 
-    def __init__(self, worlds: Worlds, game: Game) -> None:
+    def __init__(self, worlds: Worlds, game: Game, mocap_delay: Tensor) -> None:
         self.robot: RobotState = worlds.robot
         self.ball: BallSim = worlds.ball
         self.game = game
@@ -72,6 +73,7 @@ class TaskState:
         self.measures = {name: torch.zeros(count, device=device) for name in Measures.vars}  # type: ignore[attr-defined]
         self._allocate(count, device)
         self._record(worlds)
+        self.mocap_delay = mocap_delay
 
     def _allocate(self, count: int, device: torch.device) -> None:
         self.base_error, self.shift = torch.zeros(count, 2, device=device), torch.zeros(count, 2, device=device)

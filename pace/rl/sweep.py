@@ -13,7 +13,6 @@ from typing import Any
 from pace.config import (
     EvaluateConfig,
     RandomizationConfig,
-    SensingConfig,
     TrainConfig,
     VariationConfig,
     config_dir,
@@ -30,7 +29,6 @@ SERVES_PER_WORLD = 4  # counted, in a cell: more waste less on those that are no
 SLOWNESS = 10.0  # times that mjwarp takes on a CPU (docs/speed.md), for the time that is left
 Tables = dict[str, list[dict[str, Any]]]  # summaries of a cell's rows, by its key
 LABELS = {"noise": "sensing noise", "trunk_mass": "trunk mass", "gain": "joint gains"}
-NOISE = tuple(name for name in SensingConfig.__dataclass_fields__ if name not in ("name", "mocap_delay"))
 
 
 @dataclass(frozen=True)
@@ -59,8 +57,8 @@ def variations(task: TrainConfig, chosen: VariationConfig) -> list[Variation]:
     cells += [Variation("ball", name, (f"ball={name}",)) for name in chosen.ball or ball_presets()]
     cells += [Variation("engine", name, (f"engine={name}",)) for name in chosen.engine]
     for times in chosen.noise:
-        louder = tuple(f"sensing.{name}={getattr(sensing, name) * times}" for name in NOISE)
-        cells.append(Variation("noise", f"x {times:g}", louder))
+        louder = _range("sensing.noise_scale", [scale * times for scale in sensing.noise_scale])
+        cells.append(Variation("noise", f"x {times:g}", (louder,)))
     for extra in chosen.latency:
         later = _range("sensing.mocap_delay", [delay + extra for delay in sensing.mocap_delay])
         cells.append(Variation("latency", f"+{1000 * extra:g} ms", (later,)))

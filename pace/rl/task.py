@@ -237,6 +237,7 @@ def rules_of(config: TaskConfig) -> Rules:
     rules.arm_offset, rules.idle_base, rules.idle_point = reward.arm_offset, reward.idle_base_xy, idle_point(reward)
     for name in ("past_x", "low_z", "falling_x"):
         setattr(rules, name, reward.nothing_to_hit[name])
+    rules.moved = config.sensing.moved
     return rules
 
 

@@ -41,6 +41,7 @@ class Rules:
     past_x: float
     low_z: float
     falling_x: float
+    moved: float  # what a sensed ball must have moved to have turned
 
 
 @wp.struct

@@ -89,13 +89,15 @@ def _sense(
     nominal: wp.array[wp.float32],
     delay: wp.array[wp.float32],
     delays: wp.vec2,
+    scale: wp.array[wp.float32],
+    scales: wp.vec2,
     amplitude: wp.array[wp.float32],
     line: wp.array3d[wp.float32],
     sensed: wp.array2d[wp.float32],
     base_quat: wp.array[wp.vec4],
 ):
     """Sense one world. With ``reset`` the masked worlds only, as if they had stood still, with a new delay (control
-    steps, from the range ``delays``); else their ball is new."""
+    steps, from the range ``delays``) and a new scale of the noise; else their ball is new."""
     world = wp.tid()
     if reset == 1 and not mask[world]:
         return
@@ -104,8 +106,9 @@ def _sense(
     random = wp.rand_init(seed[world])
     if reset == 1:
         delay[world] = delays[0] + wp.randf(random) * (delays[1] - delays[0])
+        scale[world] = scales[0] + wp.randf(random) * (scales[1] - scales[0])
     for column in range(row.shape[0]):
-        row[column] = amplitude[column] * (2.0 * wp.randf(random) - 1.0)
+        row[column] = scale[world] * amplitude[column] * (2.0 * wp.randf(random) - 1.0)
     joints = nominal.shape[0]
     for i in range(3):
         row[i] += truth.base_angular_velocity[world][i]
@@ -123,9 +126,10 @@ def _sense(
 class Sensing:
     """Sensed signals of N worlds, overwritten in place once a control step.
 
-    Proprioception has uniform noise; motion capture (base position, heading, ball) is also late by a delay that is
-    drawn per world at reset, linearly interpolated between the control steps around it. A new ball is a new track of
-    the motion-capture system: its first sample is its first position.
+    Everything has uniform noise, whose amplitudes have a common scale that is drawn per world at reset. Motion capture
+    (base position, heading, ball) is also late by a delay that is drawn per world at reset, linearly interpolated
+    between the control steps around it. A new ball is a new track of the motion-capture system: its first sample is its
+    first position.
 
     Attributes: ``base_angular_velocity`` (N, 3) rad/s body frame, ``projected_gravity`` (N, 3), ``joint_position``
     (N, J) rad from the nominal pose, ``joint_velocity`` (N, J) rad/s, ``base_position`` (N, 3) m,
@@ -144,6 +148,7 @@ class Sensing:
         generator: torch.Generator,
     ) -> None:
         self._delays = [bound / control_dt for bound in config.mocap_delay]  # least and most, in control steps
+        self._scales = config.noise_scale
         self._num_worlds, self._device, self._generator = num_worlds, device, generator
         self._nominal = nominal
         joints = nominal.shape[0]
@@ -167,6 +172,7 @@ class Sensing:
         frames = max(2, math.ceil(self._delays[1]) + 1)
         self._line = torch.zeros(num_worlds, frames, MOCAP_COLUMNS, device=device)
         self._delay = torch.zeros(num_worlds, device=device)  # in control steps
+        self._scale = torch.ones(num_worlds, device=device)
         self._seed = torch.zeros(num_worlds, dtype=torch.int32, device=device)
         self._mask = torch.zeros(num_worlds, dtype=torch.bool, device=device)
         self._bound: tuple[RobotState, Tensor] | None = None
@@ -200,6 +206,7 @@ class Sensing:
             if name != "ball_position":
                 setattr(truth, name, share(getattr(robot, name)))
         fixed = [wp.from_torch(self._nominal), wp.from_torch(self._delay), wp.vec2(*self._delays)]
+        fixed += [wp.from_torch(self._scale), wp.vec2(*self._scales)]
         state = [wp.from_torch(tensor) for tensor in (self._amplitude, self._line, self._sensed)]
         shared = [share(self._seed), truth, *fixed, *state, wp.from_torch(self.base_quat, dtype=wp.vec4)]
         mask = share(self._mask)

@@ -105,6 +105,6 @@ def fake_game(n: int = 1, task: TaskConfig | None = None) -> tuple[Game, Any]:
 def fake_state(n: int = 1, task: TaskConfig | None = None) -> TaskState:
     """A state in the middle of a playable serve."""
     game, worlds = fake_game(n, task)
-    state = TaskState(worlds, game)
+    state = TaskState(worlds, game, torch.zeros(worlds.num_worlds))
     state.refresh()
     return state

@@ -58,9 +58,11 @@ def remembering_policy(weight: float = 0.01) -> TaskPolicy:
     assert isinstance(old.act, Policy)
     config = replace(old.config, observation=load_train_config(["observation=memory"]).observation)
     frame, history = config.observation.policy, config.observation.policy_history
-    assert [name for name in frame if name != "last_return"] == old.config.observation.policy
+    new = ("last_return", "sensed_delay")
+    assert [name for name in frame if name not in new] == old.config.observation.policy
     old_columns = torch.ones(policy_size(config) // history, dtype=torch.bool)
-    old_columns[layout(frame, POLICY)["last_return"]] = False
+    for name in new:
+        old_columns[layout(frame, POLICY)[name]] = False
     old_columns = old_columns.repeat(history)
     network = Policy.build(policy_size(config), 21, config.algo)
     weights = old.act.state_dict()

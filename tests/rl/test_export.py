@@ -36,6 +36,7 @@ from pace.rl.export import ExportError, RawReadings, compare, export_policy, ope
 from pace.rl.loading import TaskPolicy, built_in_policy, load_policy, policy_size
 from pace.rl.observations import BallTrack
 from pace.rl.policy import Policy
+from pace.rl.task import rules_of
 from pace.sim.ball import BallParams, BallSim, ball_preset
 from pace.sim.kinematics import Kinematics
 from pace.sim.robot import JOINT_NAMES, build_model
@@ -191,14 +192,15 @@ class Watched:
 def test_a_policy_that_remembers_its_returns(remembering: tuple[Path, TaskPolicy, dict[str, float]]) -> None:
     file, policy, differences = remembering
     assert max(differences.values()) < 1e-4
-    assert list(differences)[-1] == "return_memory_next"
+    assert list(differences)[-2:] == ["return_memory_next", "delay_estimate_next"]
     session, meta = open_session(file), stored(file)
-    assert (
-        [port.name for port in session.get_inputs()] == list(input_ports(policy.config)) == [*INPUTS, "return_memory"]
-    )
+    inputs = [port.name for port in session.get_inputs()]
+    assert inputs == list(input_ports(policy.config)) == [*INPUTS, "return_memory", "delay_estimate"]
     assert [port.name for port in session.get_outputs()] == list(output_ports(policy.config))
     assert meta["inputs"]["return_memory"]["shape"] == [5, 24]
+    assert meta["inputs"]["delay_estimate"]["shape"] == [5, 8]
     assert meta["kept"]["return_memory"] == "return_memory_next"
+    assert meta["kept"]["delay_estimate"] == "delay_estimate_next"
 
 
 def test_returns_are_seen_while_it_is_compared(remembering: tuple[Path, TaskPolicy, dict[str, float]]) -> None:
@@ -273,7 +275,7 @@ def test_paddle_and_base_as_the_kernels_have_them() -> None:
 def test_the_ball_is_followed_as_in_the_task() -> None:
     torch.manual_seed(3)
     config, worlds = make_config(), 64
-    track = BallTrack(config.predictor.frames, config.reward.nothing_to_hit, worlds, torch.device("cpu"))
+    track = BallTrack(config.predictor.frames, rules_of(config), worlds, torch.device("cpu"))
     graph, frames = BallTracks(config), config.predictor.frames
     length = frames + config.observation.policy_history - 1
     sensed = torch.tensor([0.0, 0.0, 1.0]).repeat(worlds, 1)

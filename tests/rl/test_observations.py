@@ -26,7 +26,7 @@ from pace.rl.task import rules_of
 from pace.sim.sensing import Sensing
 from tests.rl.fakes import CPU, config, fake_state, fake_worlds
 
-RULE = config().reward.nothing_to_hit
+RULES = rules_of(config())
 NO = torch.zeros(1, dtype=torch.bool)
 YES = torch.ones(1, dtype=torch.bool)
 IDLE = torch.tensor([-1.7, -0.3, 1.0])
@@ -34,7 +34,7 @@ IDLE = torch.tensor([-1.7, -0.3, 1.0])
 
 @pytest.mark.parametrize(
     ("overrides", "policy", "critic"),
-    [(("observation=paper",), 82, 93), (("observation=pace",), 90, 107), (("observation=memory",), 95, 109)],
+    [(("observation=paper",), 82, 93), (("observation=pace",), 90, 107), (("observation=memory",), 96, 110)],
 )
 def test_sizes(overrides: tuple[str, ...], policy: int, critic: int) -> None:
     names = config(*overrides).observation
@@ -83,7 +83,7 @@ def test_history_is_oldest_first_and_filled_at_reset() -> None:
 
 
 def test_ball_track_is_oldest_first_and_restarts_with_a_new_ball() -> None:
-    track = BallTrack(5, RULE, 1, CPU)
+    track = BallTrack(5, RULES, 1, CPU)
     track.restart(YES, torch.tensor([[1.3, 0.0, 1.0]]))
     assert track.positions[0, 0::3].tolist() == pytest.approx([1.3] * 5)
     for x in (1.2, 1.1, 1.0):
@@ -105,14 +105,25 @@ def test_ball_track_is_oldest_first_and_restarts_with_a_new_ball() -> None:
     ],
 )
 def test_something_to_hit_as_far_as_the_robot_can_know(path: list[tuple[float, float]], expected: bool) -> None:
-    track = BallTrack(5, RULE, 1, CPU)
+    track = BallTrack(5, RULES, 1, CPU)
     for i, (x, z) in enumerate(path):
         track.update(torch.tensor([[x, 0.0, z]]), YES if i == 0 else NO)
     assert bool(track.something_to_hit) is expected
 
 
+def test_noise_turns_no_ball_that_is_seen_late() -> None:
+    """Motion capture that is more than a control step late sees a new ball where it was launched twice."""
+    track = BallTrack(5, RULES, 1, CPU)
+    for i, x in enumerate((1.350, 1.378, 1.25, 1.12)):  # twice the paper's noise: +-14 mm
+        track.update(torch.tensor([[x, 0.0, 1.0]]), YES if i == 0 else NO)
+        assert bool(track.something_to_hit)
+    for x in (-1.40, -1.43, -1.365):  # hit between the second and the third: 3.5 cm away again
+        track.update(torch.tensor([[x, 0.0, 1.0]]), NO)
+    assert bool(track.turned)
+
+
 def test_a_ball_that_turned_away_stays_gone_until_the_next_one() -> None:
-    track = BallTrack(5, RULE, 1, CPU)
+    track = BallTrack(5, RULES, 1, CPU)
     for x in (-1.5, -1.4, -1.3, -1.35, -1.4, -1.45):  # comes back from the net
         track.update(torch.tensor([[x, 0.0, 1.0]]), NO)
     assert bool(track.turned)
@@ -131,10 +142,10 @@ def fake_actor(task: TaskConfig, output: Tensor | None) -> ActorSignals:
         assert output is not None
         return output.repeat(positions.shape[0], 1)
 
-    predictor, rule = predict if output is not None else None, task.reward.nothing_to_hit
+    predictor = predict if output is not None else None
     action = torch.zeros(1, 21)
     kinematics = worlds.kinematics
-    actor = ActorSignals(sensing, kinematics, worlds.nominal, action, predictor, task.predictor, rule, rules_of(task))
+    actor = ActorSignals(sensing, kinematics, worlds.nominal, action, predictor, task.predictor, rules_of(task))
     for x in (0.7, 0.6, 0.5):
         actor.track.update(torch.tensor([[x, 0.0, 1.1]]), torch.tensor([x == 0.7]))
     return actor

@@ -361,7 +361,7 @@ def test_episodes_count_five_serves_and_first_ones_start_anywhere() -> None:
     assert not clock.index.any()
     clock.finish(everyone)
     clock.time.fill_(0.9)
-    state = TaskState(worlds, game)
+    state = TaskState(worlds, game, torch.zeros(worlds.num_worlds))
     state.derive()
     assert float(state.serve_progress[0]) == pytest.approx(0.5)
     assert float(state.episode_progress[0]) == pytest.approx(1.5 / 5)
@@ -376,7 +376,7 @@ def test_endless_play_has_no_last_serve() -> None:
     game.close()
     assert game.ends.over.all()
     assert not game.ends.truncated.any()
-    state = TaskState(worlds, game)
+    state = TaskState(worlds, game, torch.zeros(worlds.num_worlds))
     state.derive()
     assert not state.episode_progress.any()
 

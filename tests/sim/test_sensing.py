@@ -90,6 +90,21 @@ def test_noise_is_uniform_with_the_configured_amplitude() -> None:
     assert float(sensing.base_shift_noise.abs().max()) <= 0.007
 
 
+def test_the_scale_of_the_noise_is_drawn_per_world_and_kept() -> None:
+    worlds, steps = 500, 60
+    sensing, robot = make(replace(config("sensing=paper").sensing, noise_scale=[0.5, 2.0]), worlds), fake_robot(worlds)
+    nobody = torch.zeros(worlds, dtype=torch.bool)
+    sensing.reset(~nobody, robot, torch.zeros(worlds, 3))
+    squares = torch.zeros(worlds)
+    for _ in range(steps):
+        sensing.update(robot, torch.zeros(worlds, 3), nobody)
+        squares += (sensing.joint_position - robot.joint_position).square().mean(1)
+    scale = (3.0 * squares / steps).sqrt() / 0.01  # of uniform noise of +-0.01 rad
+    assert float(scale.min()) == pytest.approx(0.5, abs=0.04)
+    assert float(scale.max()) == pytest.approx(2.0, abs=0.12)
+    assert float(scale.mean()) == pytest.approx(1.25, abs=0.06)
+
+
 def test_reset_changes_only_masked_worlds() -> None:
     sensing, robot = make(config("sensing=paper").sensing), fake_robot(4)
     sensing.reset(ALL, robot, ball_at(1.0))

@@ -1,0 +1,65 @@
+"""How late motion capture is: its yaw against the gyroscope's, as cameras and inertial units are calibrated in time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from pace.config import DelayEstimateConfig
+from pace.rl.signal_kernels import DELAY_SIZE, DelayRules, estimate_delay
+from pace.sim.sensing import Sensing
+from pace.sim.sharing import record, share
+
+
+class DelayEstimate:
+    """The delay of each world's motion capture, from the turns of its trunk since the episode began.
+
+    The gyroscope reports a turn at once, motion capture ``delay`` seconds later: yaw(t) = psi(t) - delay * rate(t), as
+    long as the rate changes little within the delay. Differences from step to step, smoothed by the same filter on both
+    sides, leave out where the yaw began:
+
+        behind = F[rate dt - yaw step] = delay * F[rate step] = delay * change
+
+    and least squares over all steps, with a prior, is the estimate: (sum change * behind + prior * worth) /
+    (sum change^2 + worth). One swing at 4 rad/s is worth as much as the prior and more.
+
+    Attributes: ``state`` (N, 8): all that is remembered (columns: :func:`pace.rl.signal_kernels.estimate_delay`);
+    ``seen`` (N, 1) s: the estimate minus the prior, its last column. A new episode begins with 0.
+
+    Args:
+        config: numbers of the estimate.
+        control_dt: s.
+        sensing: the robot's sensors.
+    """
+
+    def __init__(self, config: DelayEstimateConfig, control_dt: float, sensing: Sensing) -> None:
+        turning = sensing.base_angular_velocity
+        count, device = turning.shape[0], turning.device
+        self.state = torch.zeros(count, DELAY_SIZE, device=device)
+        self.seen = self.state[:, -1:]
+        self._mask = torch.zeros(count, dtype=torch.bool, device=device)
+        arrays = [share(turning), share(sensing.projected_gravity), wp.from_torch(sensing.heading)]
+        shared = [*arrays, delay_rules(config, control_dt), wp.from_torch(self.state)]
+        self._update: Callable[[], None] = record(estimate_delay, count, [share(self._mask), 0, *shared], device)
+        self._restart: Callable[[], None] = record(estimate_delay, count, [share(self._mask), 1, *shared], device)
+
+    def update(self) -> None:
+        """One control step later: the sensors' signals are new."""
+        self._update()
+
+    def restart(self, mask: Tensor) -> None:
+        """Forget everything in the worlds of ``mask`` (N,) bool, and begin with what they sense now."""
+        self._mask.copy_(mask)
+        self._restart()
+
+
+def delay_rules(config: DelayEstimateConfig, control_dt: float) -> DelayRules:
+    """The numbers in the kernel's form."""
+    rules = DelayRules()
+    rules.control_dt = control_dt
+    rules.prior, rules.prior_worth = config.prior, config.prior_worth
+    rules.smoothing, rules.fading = config.smoothing, config.fading
+    return rules
