@@ -31,7 +31,8 @@ from pace.rl.run_queue import Run, RunQueue, check_settings
 
 FIGURE = "ablation.png"
 DPI = 110
-OWN_KEYS = ("name", "seed", "samples", "minutes", "run_dir", "resume", "init_from", "progress")  # given to each run
+#: Given to each run, or to none.
+OWN_KEYS = ("name", "seed", "samples", "minutes", "run_dir", "resume", "init_from", "predictor_from", "progress")
 TRAINING_KEYS = tuple(key for key in TrainConfig.__dataclass_fields__ if key not in OWN_KEYS)
 Curves = dict[str, list[Curve]]  # of the seeds that there are, by experiment
 

@@ -198,7 +198,9 @@ def prune_checkpoints(run_dir: Path, keep: int) -> None:
 
 
 #: Keys that say where and how a run was made, not what it learned: a kept policy has their defaults.
-RUN_KEYS: dict[str, Any] = {"device": "auto", "processes": 0, "run_dir": None, "resume": None, "init_from": None}
+RUN_KEYS: dict[str, Any] = {
+    "device": "auto", "processes": 0, "run_dir": None, "resume": None, "init_from": None, "predictor_from": None
+}  # fmt: skip
 
 
 def export_weights(path: str | Path, folder: str | Path) -> Path:

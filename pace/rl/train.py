@@ -7,6 +7,7 @@ Examples::
     torchrun --nproc-per-node=8 -m pace.rl.train device=cuda num_worlds=32768    # eight GPUs, or several machines
     python -m pace.rl.train resume=runs/2026-01-01_pace minutes=60
     python -m pace.rl.train init_from=runs/2026-01-01_pace ball=paper
+    python -m pace.rl.train init_from=runs/2026-01-01_pace predictor=filter predictor_from=runs/2026-01-01_predictor
 """
 
 from __future__ import annotations
@@ -71,7 +72,7 @@ def resumed_config(saved: Checkpoint, path: str, overrides: list[str]) -> TrainC
             raise ConfigError(f"'{key}' cannot change in a resumed run ({', '.join(RESUME_KEYS)} can): use init_from")
     changed = OmegaConf.merge(OmegaConf.create(saved.config), OmegaConf.from_dotlist(overrides))
     config = parse(OmegaConf.to_container(changed), TrainConfig)  # type: ignore[arg-type]
-    config.resume, config.init_from = path, None
+    config.resume, config.init_from, config.predictor_from = path, None, None
     if saved.counters["samples"] >= config.samples:
         raise ConfigError(f"{path} has {saved.counters['samples']} samples: give samples= above that to go on")
     if saved.path is not None:  # where the run lies now; it may have been moved or copied since it was saved
@@ -80,7 +81,7 @@ def resumed_config(saved: Checkpoint, path: str, overrides: list[str]) -> TrainC
 
 
 def build_trainer(config: TrainConfig, saved: Checkpoint | None, device: torch.device, team: Team) -> Trainer:
-    """Networks, this process's worlds and the leader's run folder; state from ``saved`` or ``config.init_from``.
+    """Networks, this process's worlds and the leader's run folder; state from ``saved`` or :func:`first_weights`.
 
     Errors: :class:`ConfigError` for worlds that the team cannot share equally.
     """
@@ -88,7 +89,7 @@ def build_trainer(config: TrainConfig, saved: Checkpoint | None, device: torch.d
 
     if config.num_worlds % team.size:
         raise ConfigError(f"num_worlds {config.num_worlds} cannot be shared equally by {team.size} processes")
-    start = load_checkpoint(config.init_from, weights_only=True) if config.init_from else None
+    start = first_weights(config)
     torch.manual_seed(config.seed)
     predictor = PredictorNetwork(config.predictor).to(device)
     threads = config.engine.threads or threads_of(team.size)
@@ -102,6 +103,22 @@ def build_trainer(config: TrainConfig, saved: Checkpoint | None, device: torch.d
     elif start:
         trainer.load_weights(start)
     return trainer
+
+
+def first_weights(config: TrainConfig) -> Checkpoint | None:
+    """What a new run starts from: ``config.init_from`` with the predictor of ``config.predictor_from``, or one of them.
+
+    Errors: :class:`CheckpointError` for one that cannot be read.
+    """
+    start = load_checkpoint(config.init_from, weights_only=True) if config.init_from else None
+    if not config.predictor_from:
+        return start
+    given = load_checkpoint(config.predictor_from, weights_only=True)
+    if "predictor" not in given.weights:
+        raise CheckpointError(f"{given.path} has no predictor: give predictor_from a run of pace.predictor.train")
+    if start is None:
+        return replace(given, weights={"predictor": given.weights["predictor"]})
+    return replace(start, weights=start.weights | {"predictor": given.weights["predictor"]})
 
 
 def open_run(config: TrainConfig, first_update: int) -> RunFolder:

@@ -273,7 +273,8 @@ class Trainer:
             raise CheckpointError(f"{checkpoint.path}: the weights of the predictor are missing")
         for part, module in self._networks():
             if part in checkpoint.weights:
-                load_weights(module, checkpoint.weights[part], f"{checkpoint.path} ({part})")
+                cure = "; predictor_from=RUN takes another run's" if part == "predictor" else ""
+                load_weights(module, checkpoint.weights[part], f"{checkpoint.path} ({part}{cure})")
         self.agent.actor.bound_std(self.config.algo.std_floor, self.config.algo.std[0].value)
 
     def resume(self, checkpoint: Checkpoint) -> None:

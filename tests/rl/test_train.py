@@ -66,6 +66,19 @@ def test_init_from_starts_anew_with_the_weights(train, tmp_path: Path) -> None:
     assert 0.0 < change.abs().max().item() < 0.1
 
 
+def test_a_policy_can_go_on_with_another_predictor(train, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert real_run(train, tmp_path / "policy", 1) == 0
+    assert real_run(train, tmp_path / "filter", 1, "predictor=filter") == 0
+    begin = ["predictor=filter", f"init_from={tmp_path / 'policy'}"]
+    assert real_run(train, tmp_path / "new", 1, *begin) == 1
+    assert "predictor_from=RUN" in capfd.readouterr().err
+    assert real_run(train, tmp_path / "new", 1, *begin, f"predictor_from={tmp_path / 'filter'}") == 0
+    new, policy, flight = (load_checkpoint(tmp_path / name).weights for name in ("new", "policy", "filter"))
+    for part, name, like in (("agent", "actor.mlp.layers.0.weight", policy), ("predictor", "layers.0.weight", flight)):
+        change = (new[part][name] - like[part][name]).abs().max().item()
+        assert 0.0 < change < 0.1
+
+
 @pytest.mark.parametrize(
     ("arguments", "status", "words"),
     [
@@ -78,6 +91,7 @@ def test_init_from_starts_anew_with_the_weights(train, tmp_path: Path) -> None:
         (["resume=no/such/run"], 1, "no/such/run does not exist"),
         (["init_from=tests"], 1, "neither a run folder nor a checkpoint"),
         (["resume=a", "init_from=b"], 2, "not both"),
+        (["predictor_from=tests"], 1, "neither a run folder nor a checkpoint"),
     ],
 )
 def test_wrong_input_is_one_line(train, capfd: pytest.CaptureFixture[str], arguments, status, words) -> None:
