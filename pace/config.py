@@ -449,6 +449,14 @@ class TaskConfig(SimConfig):
 
 
 @dataclass
+class Stage:
+    """Changes of the task from ``samples`` control steps of a run on: overrides as ``sensing=wide``."""
+
+    samples: float
+    task: list[str]
+
+
+@dataclass
 class TrainConfig(TaskConfig):
     """``python -m pace.rl.train``: the task, the learner and the run."""
 
@@ -468,6 +476,7 @@ class TrainConfig(TaskConfig):
     progress: bool
     # a run folder or checkpoint whose predictor to start from, instead of that of init_from
     predictor_from: str | None = field(default=None, kw_only=True)
+    curriculum: list[Stage] = field(default_factory=list, kw_only=True)  # each changes the task of the one before
 
     def __post_init__(self) -> None:
         _require(self.num_worlds >= 1, f"num_worlds must be at least 1, got {self.num_worlds}")
@@ -480,6 +489,9 @@ class TrainConfig(TaskConfig):
         _require(self.minutes >= 0, f"minutes must not be negative (0: no limit), got {self.minutes}")
         _require(not (self.resume and self.init_from), "give resume or init_from, not both")
         _require(not (self.resume and self.predictor_from), "give resume or predictor_from, not both")
+        begins = [stage.samples for stage in self.curriculum]
+        _require(begins == sorted(set(begins)), f"curriculum: the stages must begin one after another, got {begins}")
+        _require(all(begin > 0 for begin in begins), "curriculum: a stage at 0 is the task itself; change that")
 
 
 @dataclass

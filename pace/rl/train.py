@@ -14,7 +14,9 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 from hydra.core.hydra_config import HydraConfig
@@ -24,6 +26,7 @@ from pace.command import run_command
 from pace.config import ConfigError, TrainConfig, parse, to_dict
 from pace.predictor.network import PredictorNetwork
 from pace.rl.checkpoint import Checkpoint, CheckpointError, load_checkpoint
+from pace.rl.curriculum import Curriculum
 from pace.rl.progress import rate_texts
 from pace.rl.rollout import RolloutError
 from pace.rl.run_folder import CURVE, METRICS, RunFolder, default_run_dir
@@ -31,8 +34,12 @@ from pace.rl.trainer import Summary, Trainer
 from pace.sim.engine import resolve_device
 from pace.team import Team, TeamError, own_device, suitable_size, team_of, threads_of
 
+if TYPE_CHECKING:
+    from pace.rl.env import TableTennisEnv
+
 # What a resumed run may change; everything else is as it was saved, or the run would not go on where it stopped.
 RESUME_KEYS = ("resume", "samples", "minutes", "checkpoint_minutes", "tensorboard", "progress", "device")
+SEEDS_APART = 1_000_003  # between the stages of a curriculum: further than seeds of runs lie apart
 
 
 def main() -> int:
@@ -85,24 +92,33 @@ def build_trainer(config: TrainConfig, saved: Checkpoint | None, device: torch.d
 
     Errors: :class:`ConfigError` for worlds that the team cannot share equally.
     """
-    from pace.rl.env import TableTennisEnv
-
     if config.num_worlds % team.size:
         raise ConfigError(f"num_worlds {config.num_worlds} cannot be shared equally by {team.size} processes")
     start = first_weights(config)
     torch.manual_seed(config.seed)
     predictor = PredictorNetwork(config.predictor).to(device)
-    threads = config.engine.threads or threads_of(team.size)
-    task = replace(config, engine=replace(config.engine, threads=threads))
-    env = TableTennisEnv(task, config.num_worlds // team.size, device, team.seed(config.seed), predictor)
+    make = partial(make_worlds, device=device, team=team, predictor=predictor)
+    curriculum = Curriculum(config, make, saved.counters["samples"] if saved else 0.0)
     run = open_run(config, int(saved.counters["updates"]) if saved else 0) if team.leads else None
-    trainer = Trainer(config, env, predictor, run, team)
+    trainer = Trainer(config, curriculum.worlds, predictor, run, team, curriculum)
     torch.manual_seed(team.seed(config.seed))  # the networks began alike, what is played does not
     if saved:
         trainer.resume(saved)
     elif start:
         trainer.load_weights(start)
     return trainer
+
+
+def make_worlds(
+    task: TrainConfig, stage: int, device: torch.device, team: Team, predictor: PredictorNetwork
+) -> TableTennisEnv:
+    """This process's worlds of one stage of the curriculum; each stage draws from random numbers of its own."""
+    from pace.rl.env import TableTennisEnv
+
+    threads = task.engine.threads or threads_of(team.size)
+    task = replace(task, engine=replace(task.engine, threads=threads))
+    seed = team.seed(task.seed + SEEDS_APART * stage)
+    return TableTennisEnv(task, task.num_worlds // team.size, device, seed, predictor)
 
 
 def first_weights(config: TrainConfig) -> Checkpoint | None:

@@ -27,6 +27,7 @@ from pace.rl.checkpoint import (
     prune_checkpoints,
     save_checkpoint,
 )
+from pace.rl.curriculum import Curriculum
 from pace.rl.policy import Agent
 from pace.rl.ppo import PPO
 from pace.rl.progress import Progress
@@ -109,7 +110,7 @@ class Trainer:
 
     ``predictor`` is the network that ``env`` predicts with; it is trained in place. ``env`` holds this process's
     worlds; the processes of a ``team`` each have a trainer, go through every method together, and the leader has the
-    ``run``.
+    ``run``. A ``curriculum`` gives other worlds where another of its stages begins.
     """
 
     def __init__(
@@ -119,7 +120,9 @@ class Trainer:
         predictor: PredictorNetwork,
         run: RunFolder | None,
         team: Team | None = None,
+        curriculum: Curriculum[Any] | None = None,
     ) -> None:
+        self.curriculum = curriculum
         self.config, self.env, self.predictor, self.run = config, env, predictor, run
         self.team = team = team or Team()
         self.device = env.policy_observation.device
@@ -194,10 +197,16 @@ class Trainer:
     def _samples_per_update(self) -> int:
         return self.team.size * self.num_worlds * self.rollout.steps
 
+    def _move_on(self) -> None:
+        """The next stage's worlds, where one begins; after an update, so that a checkpoint has what comes next."""
+        if self.curriculum is not None and self.curriculum.move_on(self.samples):
+            self.env.warn_of_overflow()
+            self.env = self.curriculum.worlds
+
     def _fit_storage(self) -> None:
-        """Make room for as many steps as the next update is to have (``algo.later_steps``)."""
+        """Make room for the present worlds and as many steps as the next update is to have (``algo.later_steps``)."""
         steps = self.config.algo.steps_at(self.samples)
-        if steps != self.rollout.steps:
+        if steps != self.rollout.steps or self.env is not self.rollout.env:
             self.rollout = Rollout(self.env, self.agent, steps)
             self.regression.resize(steps)
 
@@ -219,6 +228,9 @@ class Trainer:
         self.samples += self._samples_per_update
         self.updates += 1
         task = summarise(self.env.pop_statistics(), self.config.robot.control_dt, self.team)
+        if self.config.curriculum and self.curriculum is not None:
+            task["stage"] = float(self.curriculum.stage)
+        self._move_on()
         return {"update": self.updates, "samples": self.samples, **task, **prediction, **learning}
 
     def _require_no_fault(self) -> None:

@@ -1,0 +1,54 @@
+"""Tasks that follow one another in a run: worlds are made anew where a stage of the curriculum begins."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+from pace.config import ConfigError, TrainConfig
+from pace.rl.loading import override_task
+
+Worlds = TypeVar("Worlds")
+
+
+class Curriculum(Generic[Worlds]):
+    """Makes the worlds of each stage; the networks and everything learned stay.
+
+    Args:
+        config: of the run; its task is the first stage, and ``config.curriculum`` has the others.
+        make: worlds of a task, given its configuration and the number of the stage, 0 for the first.
+        samples: control steps of the run so far; :attr:`worlds` are made for the stage that they are in.
+
+    Attributes: ``tasks`` the configuration of each stage; ``stage`` the present one, ``worlds`` those made for it.
+    Errors: :class:`ConfigError` for changes that the task does not know, which names the stage.
+    """
+
+    def __init__(self, config: TrainConfig, make: Callable[[TrainConfig, int], Worlds], samples: float) -> None:
+        self.tasks = stage_tasks(config)
+        self._begins = [0.0, *(stage.samples for stage in config.curriculum)]
+        self._make = make
+        self.stage = self._due(samples)
+        self.worlds = make(self.tasks[self.stage], self.stage)
+
+    def _due(self, samples: float) -> int:
+        return sum(begin <= samples for begin in self._begins) - 1
+
+    def move_on(self, samples: float) -> bool:
+        """Make new worlds if another stage has begun by ``samples`` control steps; returns whether it has."""
+        due = self._due(samples)
+        if due == self.stage:
+            return False
+        self.stage = due
+        self.worlds = self._make(self.tasks[due], due)
+        return True
+
+
+def stage_tasks(config: TrainConfig) -> list[TrainConfig]:
+    """The configuration of each stage, the first of which is ``config``; each changes the one before."""
+    tasks = [config]
+    for stage in config.curriculum:
+        try:
+            tasks.append(override_task(tasks[-1], stage.task))
+        except ConfigError as error:
+            raise ConfigError(f"curriculum, from {stage.samples:g} control steps on: {error}") from error
+    return tasks
