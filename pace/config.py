@@ -288,6 +288,16 @@ class DelayEstimateConfig:
 
 
 @dataclass
+class AttitudeEstimateConfig:
+    """How the robot knows its orientation better than its sensors (:class:`pace.rl.attitude.AttitudeEstimate`)."""
+
+    gain: float  # share of what is sensed in each control step's estimate; the rest is the last one, turned on
+
+    def __post_init__(self) -> None:
+        _require(0 < self.gain <= 1, f"observation.attitude_estimate.gain must lie in (0, 1], got {self.gain}")
+
+
+@dataclass
 class ObservationConfig:
     """Names of the observations of each network, in order, and how many control steps of history each sees."""
 
@@ -298,6 +308,8 @@ class ObservationConfig:
     critic_history: int
     return_memory: ReturnMemoryConfig | None = None  # needed by the observation last_return
     delay_estimate: DelayEstimateConfig | None = None  # needed by the observation sensed_delay
+    # needed by the observations estimated_gravity and estimated_heading; with them it gives the paddle's pose too
+    attitude_estimate: AttitudeEstimateConfig | None = None
 
     @property
     def memory(self) -> ReturnMemoryConfig | None:
@@ -308,6 +320,11 @@ class ObservationConfig:
     def delay(self) -> DelayEstimateConfig | None:
         """Numbers of the estimate of the delay, where the policy observes it."""
         return self.delay_estimate if "sensed_delay" in self.policy else None
+
+    @property
+    def attitude(self) -> AttitudeEstimateConfig | None:
+        """Numbers of the filter of the orientation, where the policy observes it."""
+        return self.attitude_estimate if {"estimated_gravity", "estimated_heading"} & set(self.policy) else None
 
     def __post_init__(self) -> None:
         _require(self.policy_history >= 1, "observation.policy_history must be at least 1")

@@ -16,12 +16,12 @@ from torch import Tensor, nn
 
 from pace.config import TaskConfig
 from pace.predictor.network import PredictorNetwork
-from pace.rl.deployed_memory import DelayEstimateStep, ReturnMemoryStep
+from pace.rl.deployed_memory import AttitudeEstimateStep, DelayEstimateStep, ReturnMemoryStep
 from pace.rl.loading import TaskPolicy
 from pace.rl.memory import SEEN
 from pace.rl.observations import JOINTS, check_policy
 from pace.rl.policy import Policy
-from pace.rl.signal_kernels import DELAY_SIZE, MEMORY_SIZE
+from pace.rl.signal_kernels import ATTITUDE_SIZE, DELAY_SIZE, MEMORY_SIZE
 from pace.rl.task import idle_point
 from pace.rl.task_kernels import LONGEST_TIME
 from pace.sim.robot import TRUNK_BODY, nominal_pose
@@ -88,25 +88,46 @@ DELAY_OUTPUTS = {
         "kept by the caller as delay_estimate of the next call; the last: delay of motion capture above the prior",
     ),
 }
+#: Inputs and outputs besides, of a policy that observes ``estimated_gravity`` or ``estimated_heading``.
+ATTITUDE_INPUTS = {
+    "attitude": Port(
+        ATTITUDE_SIZE, "1, rad/s", "the output attitude_next of the calls before; zeros before the first one"
+    ),
+}
+ATTITUDE_OUTPUTS = {
+    "attitude_next": Port(
+        ATTITUDE_SIZE,
+        "1, rad/s",
+        "kept by the caller as attitude of the next call: 1, estimated gravity and heading, angular velocity",
+    ),
+}
 #: Input -> the output of the calls before that it is made of. An ONNX graph has one name space, hence the other names.
 KEPT = {
     "previous_action": "action",
     "ball_moved_away": "ball_moved_away_next",
     "return_memory": "return_memory_next",
     "delay_estimate": "delay_estimate_next",
+    "attitude": "attitude_next",
 }
 
 
 def input_ports(config: TaskConfig) -> dict[str, Port]:
     """The policy's inputs, in order."""
-    observation = config.observation
-    return INPUTS | (MEMORY_INPUTS if observation.memory else {}) | (DELAY_INPUTS if observation.delay else {})
+    return INPUTS | _of_those_kept(config, MEMORY_INPUTS, DELAY_INPUTS, ATTITUDE_INPUTS)
 
 
 def output_ports(config: TaskConfig) -> dict[str, Port]:
     """The policy's outputs, in order."""
+    return OUTPUTS | _of_those_kept(config, MEMORY_OUTPUTS, DELAY_OUTPUTS, ATTITUDE_OUTPUTS)
+
+
+def _of_those_kept(
+    config: TaskConfig, memory: dict[str, Port], delay: dict[str, Port], attitude: dict[str, Port]
+) -> dict[str, Port]:
     observation = config.observation
-    return OUTPUTS | (MEMORY_OUTPUTS if observation.memory else {}) | (DELAY_OUTPUTS if observation.delay else {})
+    ports = memory if observation.memory else {}
+    ports = ports | (delay if observation.delay else {})
+    return ports | (attitude if observation.attitude else {})
 
 
 def kept_outputs(config: TaskConfig) -> dict[str, str]:
@@ -306,6 +327,9 @@ class DeployedPolicy(nn.Module):
         self.memory = ReturnMemoryStep(numbers, config.robot.control_dt) if numbers else None
         numbers = config.observation.delay
         self.delay = DelayEstimateStep(numbers, config.robot.control_dt) if numbers else None
+        numbers = config.observation.attitude
+        self.attitude = AttitudeEstimateStep(numbers, config.robot.control_dt) if numbers else None
+        self.kept = [name for name in input_ports(config) if name not in INPUTS]
         self.names = list(config.observation.policy)
         self.action_scale, self.action_clip = config.robot.action_scale, config.robot.action_clip
         self.register_buffer("nominal", torch.tensor(nominal_pose(config.robot), dtype=torch.float32))
@@ -329,7 +353,13 @@ class DeployedPolicy(nn.Module):
         """See the class; ``kept``: what is remembered, where the policy observes it."""
         tracks, hittable, moved_away = self.tracks(ball_position, ball_launched, ball_moved_away)
         prediction = self.reader(tracks, hittable, base_position)
-        rotation = base_rotation(projected_gravity, heading)
+        past, new = dict(zip(self.kept, kept, strict=True)), dict[str, Tensor]()
+        sensed = (base_angular_velocity[:, -1], projected_gravity[:, -1], heading[:, -1])
+        down, ahead = projected_gravity, heading
+        if self.attitude is not None:
+            new["attitude"] = self.attitude(past["attitude"][:, -1], *sensed)
+            down, ahead = _since_first(_with_newest(past["attitude"], new["attitude"]))[..., 1:6].split([3, 2], dim=-1)
+        rotation = base_rotation(down, ahead)
         paddle, normal = self.chain(base_position, rotation, joint_position)
         frames = {
             "base_angular_velocity": base_angular_velocity,
@@ -347,25 +377,30 @@ class DeployedPolicy(nn.Module):
             "predicted_time": prediction.time,
             "something_to_hit": hittable.unsqueeze(-1).float(),
         }
-        kept_next: list[Tensor] = []
-        waiting = list(kept)
+        if self.attitude is not None:
+            frames |= {"estimated_gravity": down, "estimated_heading": ahead}
         if self.memory is not None:
-            past = waiting.pop(0)
-            new = self.memory(past[:, -1], tracks[:, -1], moved_away[:, -1:], paddle[:, -1], normal[:, -1])
-            frames["last_return"] = _with_newest(past, new)[..., -SEEN:]
-            kept_next.append(new)
+            hit = (tracks[:, -1], moved_away[:, -1:], paddle[:, -1], normal[:, -1])
+            new["return_memory"] = self.memory(past["return_memory"][:, -1], *hit)
+            frames["last_return"] = _with_newest(past["return_memory"], new["return_memory"])[..., -SEEN:]
         if self.delay is not None:
-            past = waiting.pop(0)
-            new = self.delay(past[:, -1], base_angular_velocity[:, -1], projected_gravity[:, -1], heading[:, -1])
-            frames["sensed_delay"] = _with_newest(past, new)[..., -1:]
-            kept_next.append(new)
+            new["delay_estimate"] = self.delay(past["delay_estimate"][:, -1], *sensed)
+            frames["sensed_delay"] = _with_newest(past["delay_estimate"], new["delay_estimate"])[..., -1:]
         observation = torch.cat([frames[name] for name in self.names], dim=-1).flatten(1)
         action = self.policy(observation).clamp(-self.action_clip, self.action_clip)
         seen = (prediction.apex[:, -1], prediction.target[:, -1], prediction.time[:, -1])
         flags = (hittable[:, -1:].float(), moved_away[:, :1].float())  # the next history begins one frame later
-        return self.nominal + self.action_scale * action, action, *seen, *flags, *kept_next
+        return self.nominal + self.action_scale * action, action, *seen, *flags, *(new[name] for name in self.kept)
 
 
 def _with_newest(past: Tensor, newest: Tensor) -> Tensor:
     """What was kept (N, frames, size), each the newest of its call, and this call's; the oldest is dropped."""
     return torch.cat((past[:, 1:], newest.unsqueeze(1)), dim=1)
+
+
+def _since_first(kept: Tensor) -> Tensor:
+    """What was kept (N, frames, size), the first column 1; frames before the first call, all 0, become as that one."""
+    frames = [kept[:, -1]]
+    for frame in reversed(kept[:, :-1].unbind(1)):
+        frames.insert(0, torch.where(frame[:, :1] > 0.5, frame, frames[0]))
+    return torch.stack(frames, dim=1)

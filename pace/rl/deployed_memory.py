@@ -1,4 +1,7 @@
-"""What a robot keeps over an episode (:mod:`pace.rl.memory`, :mod:`pace.rl.delay`), in torch, for exported policies."""
+"""What a robot keeps over an episode, in torch, for exported policies.
+
+See :mod:`pace.rl.memory`, :mod:`pace.rl.delay` and :mod:`pace.rl.attitude`.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +9,9 @@ import math
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
-from pace.config import DelayEstimateConfig, ReturnMemoryConfig
+from pace.config import AttitudeEstimateConfig, DelayEstimateConfig, ReturnMemoryConfig
 from pace.rl.signal_kernels import AGE, BEFORE, NORMAL_1, POSITION_1, POSITION_2, RETURN, SMALLEST_TILT
 from pace.sim.aero import GRAVITY
 
@@ -83,8 +87,7 @@ class DelayEstimateStep(nn.Module):
         """
         config = self.config
         known, last_yaw, last_rate, behind, change, products, squares, _ = kept.split(1, dim=1)
-        tilt = gravity[:, 1:].square().sum(1, keepdim=True).clamp(min=SMALLEST_TILT)
-        rate = -(gravity[:, 1:] * angular_velocity[:, 1:]).sum(1, keepdim=True) / tilt
+        rate = yaw_rate(gravity, angular_velocity)
         yaw = torch.atan2(heading[:, 1:], heading[:, :1])
         turn = yaw - last_yaw
         turn = turn - 2.0 * math.pi * torch.round(turn / (2.0 * math.pi))
@@ -96,3 +99,39 @@ class DelayEstimateStep(nn.Module):
         estimate = (products - config.prior * squares) / (squares + config.prior_worth)
         learned = known * torch.cat((behind, change, products, squares, estimate), dim=1)  # zeros at first
         return torch.cat((torch.ones_like(known), yaw, rate, learned), dim=1)
+
+
+def yaw_rate(gravity: Tensor, angular_velocity: Tensor) -> Tensor:
+    """(N, 1) rad/s, of the trunk's x axis on the ground, from (N, 3) each, body frame."""
+    tilt = gravity[:, 1:].square().sum(1, keepdim=True).clamp(min=SMALLEST_TILT)
+    return -(gravity[:, 1:] * angular_velocity[:, 1:]).sum(1, keepdim=True) / tilt
+
+
+class AttitudeEstimateStep(nn.Module):
+    """One control step of the filter, as the kernel :func:`pace.rl.signal_kernels.estimate_attitude` computes it.
+
+    Args: config: numbers of the filter; control_dt: s.
+    """
+
+    def __init__(self, config: AttitudeEstimateConfig, control_dt: float) -> None:
+        super().__init__()
+        self.gain, self.control_dt = config.gain, control_dt
+
+    def forward(self, kept: Tensor, angular_velocity: Tensor, gravity: Tensor, heading: Tensor) -> Tensor:
+        """What is kept (N, 9) after this step: 1, gravity, heading, angular velocity.
+
+        Args: kept (N, 9) before it, zeros at first; angular_velocity (N, 3) rad/s and gravity (N, 3), body frame;
+        heading (N, 2).
+        """
+        known, last, forward, turning = kept.split([1, 3, 2, 3], dim=1)
+        mean = 0.5 * (angular_velocity + turning)
+        turned = last + self.control_dt * torch.linalg.cross(last, mean)
+        down = functional.normalize((1.0 - self.gain) * turned + self.gain * gravity, dim=1)
+        angle = self.control_dt * yaw_rate(down, mean)
+        along = torch.cat((-forward[:, 1:], forward[:, :1]), dim=1)
+        swept = forward * torch.cos(angle) + along * torch.sin(angle)
+        ahead = (1.0 - self.gain) * swept + self.gain * heading
+        seen = known > 0.5
+        down, ahead = torch.where(seen, down, gravity), torch.where(seen, ahead, heading)
+        parts = (functional.normalize(down, dim=1), functional.normalize(ahead, dim=1), angular_velocity)
+        return torch.cat((torch.ones_like(known), *parts), dim=1)

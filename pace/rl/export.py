@@ -31,7 +31,7 @@ from torch import Tensor
 from pace.command import run_command
 from pace.config import ExportConfig, TrainConfig, parse, to_dict
 from pace.rl.checkpoint import CheckpointError
-from pace.rl.deployed import DeployedPolicy, input_ports, input_shapes, kept_outputs, output_ports
+from pace.rl.deployed import INPUTS, DeployedPolicy, input_ports, input_shapes, kept_outputs, output_ports
 from pace.rl.env import TableTennisEnv
 from pace.rl.loading import TaskPolicy, load_policy
 from pace.rl.observations import POLICY, layout
@@ -122,6 +122,8 @@ def save_graph(graph: DeployedPolicy, config: TrainConfig, file: Path) -> None:
     """Write the graph as ONNX, for any number of robots in one call."""
     example = tuple(torch.zeros(2, *shape) for shape in input_shapes(config).values())
     robots = torch.export.Dim("robots")
+    shapes = [{0: robots} for _ in example]
+    kept = tuple(shapes[len(INPUTS) :])  # one argument of forward, *kept
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it looks for torchvision, which nothing here needs
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="# The axis name: robots")  # it is the same axis of all inputs
@@ -132,7 +134,7 @@ def save_graph(graph: DeployedPolicy, config: TrainConfig, file: Path) -> None:
             dynamo=True,
             input_names=list(input_ports(config)),
             output_names=list(output_ports(config)),
-            dynamic_shapes=tuple({0: robots} for _ in example),
+            dynamic_shapes=(*shapes[: len(INPUTS)], *((kept,) if kept else ())),
             verbose=False,
         )
     assert program is not None
@@ -302,6 +304,8 @@ def expected_outputs(env: TableTennisEnv, policy: TaskPolicy, action: Tensor) ->
         outputs["return_memory_next"] = actor.memory.seen
     if actor.delay is not None:
         outputs["delay_estimate_next"] = actor.delay.state
+    if actor.attitude is not None:
+        outputs["attitude_next"] = actor.attitude.state
     return outputs
 
 

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from pace.config import ConfigError, ObservationConfig, PredictorConfig, ReturnMemoryConfig
 from pace.predictor.network import OUTPUT_SIZES, predictor_slices
+from pace.rl.attitude import AttitudeEstimate
 from pace.rl.delay import DelayEstimate
 from pace.rl.memory import SEEN, ReturnMemory
 from pace.rl.signal_kernels import PredictionLayout, SignalArrays, fill_frames, follow_ball, read_prediction
@@ -94,7 +95,8 @@ class ActorSignals:
     Attributes, besides ``sensing`` and ``track``: ``action`` (N, J) the previous action, ``apex``, ``target``
     (N, 3) m predicted, ``time`` (N,) s until the ball is at the target, ``shift`` (N, 2) m from the sensed base to
     where it should stand, ``paddle_position`` (N, 3) m, ``paddle_normal`` (N, 3), ``prediction`` (N, P) raw output;
-    ``memory`` of its returns and ``delay`` of its motion capture, or ``None``: see :meth:`remember`.
+    ``memory`` of its returns and ``delay`` of its motion capture, or ``None``: see :meth:`remember`; ``attitude``, the
+    estimated orientation that the paddle's pose is computed with, or ``None``: the sensed one.
 
     Args:
         sensing: the robot's sensors.
@@ -134,6 +136,9 @@ class ActorSignals:
         memory, delay = (observation.memory, observation.delay) if observation else (None, None)
         self.memory = self._make_memory(memory, rules.control_dt) if memory else None
         self.delay = DelayEstimate(delay, rules.control_dt, sensing) if delay else None
+        attitude = observation.attitude if observation else None
+        self.attitude = AttitudeEstimate(attitude, rules.control_dt, sensing) if attitude else None
+        self._base_quat = self.attitude.quat if self.attitude else sensing.base_quat
 
     def _record(self, slices: dict[str, slice], rules: Rules) -> Callable[[], None]:
         columns = PredictionLayout()
@@ -164,13 +169,15 @@ class ActorSignals:
                 kept.restart(mask)
 
     def compute(self, changed: Tensor | None = None) -> None:
-        """Everything that follows from the current ``sensing``, ``track`` and ``action``.
+        """Everything that follows from the current ``sensing``, ``track`` and ``action``: once a control step.
 
-        ``changed`` (N,) bool: the worlds in which they are new; ``None``: all.
+        ``changed`` (N,) bool: the worlds in which an episode begins; the others stay. ``None``: all go on.
         """
         sensing = self.sensing
+        if self.attitude is not None:
+            self.attitude.update() if changed is None else self.attitude.restart(changed)
         torch.add(sensing.joint_position, self._nominal, out=self._joints)
-        centre, normal = self._kinematics.paddle_pose(sensing.base_position, sensing.base_quat, self._joints, changed)
+        centre, normal = self._kinematics.paddle_pose(sensing.base_position, self._base_quat, self._joints, changed)
         self.paddle_position.copy_(centre)
         self.paddle_normal.copy_(normal)
         if self.predictor is not None:
@@ -210,6 +217,11 @@ def _sensed_delay(signals: ActorSignals) -> Tensor:
     return signals.delay.seen
 
 
+def _attitude(signals: ActorSignals) -> AttitudeEstimate:
+    assert signals.attitude is not None  # check_policy has seen to it
+    return signals.attitude
+
+
 def _column(values: Tensor) -> Tensor:
     return values.unsqueeze(-1)
 
@@ -232,6 +244,8 @@ POLICY: dict[str, ActorObservation] = {
     "something_to_hit": ActorObservation(1, lambda s: _column(s.track.something_to_hit)),
     "last_return": ActorObservation(SEEN, _last_return),
     "sensed_delay": ActorObservation(1, _sensed_delay),
+    "estimated_gravity": ActorObservation(3, lambda s: _attitude(s).gravity),
+    "estimated_heading": ActorObservation(2, lambda s: _attitude(s).heading),
 }
 
 #: What the critic can see: the truth.
@@ -278,6 +292,11 @@ def check_policy(observation: ObservationConfig, predictor: PredictorConfig) -> 
             )
         if predictor.frames < 5:
             raise ConfigError(f"observation 'last_return' needs predictor.frames of 5 or more, got {predictor.frames}")
+    if {"estimated_gravity", "estimated_heading"} & set(names) and observation.attitude_estimate is None:
+        raise ConfigError(
+            "observation.policy has 'estimated_gravity' or 'estimated_heading': give observation.attitude_estimate "
+            "(observation=memory)"
+        )
     if "sensed_delay" in names and observation.delay_estimate is None:
         raise ConfigError("observation.policy has 'sensed_delay': give observation.delay_estimate (observation=memory)")
     if "predicted_time" in names and predictor.enabled and "target_time" not in predictor.outputs:

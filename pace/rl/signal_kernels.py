@@ -7,6 +7,7 @@ import warp as wp
 
 from pace.rl.task_kernels import LONGEST_TIME, Rules, clamp_x, nothing_to_hit
 from pace.sim.aero import GRAVITY
+from pace.sim.sensing import orientation
 
 #: Squared horizontal part of gravity, in the body frame, at which the x axis points up or down and has no heading.
 SMALLEST_TILT = wp.constant(1.0e-3)
@@ -206,6 +207,12 @@ def remember_return(
     _keep(row, NORMAL_1, paddle_normal[world])
 
 
+@wp.func
+def yaw_rate(down: wp.vec3, turning: wp.vec3) -> float:
+    """How fast (rad/s) the trunk's x axis turns on the ground; rotation about that axis does not turn it."""
+    return -(down[1] * turning[1] + down[2] * turning[2]) / wp.max(down[1] * down[1] + down[2] * down[2], SMALLEST_TILT)
+
+
 @wp.struct
 class DelayRules:
     """Numbers of :class:`pace.rl.delay.DelayEstimate`; s, rad^2/s^2."""
@@ -246,9 +253,7 @@ def estimate_delay(
             return
         for column in range(row.shape[0]):
             row[column] = 0.0
-    down, turning = gravity[world], angular_velocity[world]
-    # of the trunk's x axis on the ground: rotation about it does not turn it
-    rate = -(down[1] * turning[1] + down[2] * turning[2]) / wp.max(down[1] * down[1] + down[2] * down[2], SMALLEST_TILT)
+    rate = yaw_rate(gravity[world], angular_velocity[world])
     yaw = wp.atan2(heading[world, 1], heading[world, 0])
     if row[KNOWN] == 1.0:
         turn = yaw - row[YAW]
@@ -262,3 +267,51 @@ def estimate_delay(
     row[KNOWN] = 1.0
     row[YAW] = yaw
     row[RATE] = rate
+
+
+#: Columns of a world's attitude: 1 once anything was seen; estimated direction of gravity (body frame) and heading; the
+#: angular velocity one step ago.
+SEEN_ONCE, DOWN, FORWARD, TURNING = wp.constant(0), wp.constant(1), wp.constant(4), wp.constant(6)
+ATTITUDE_SIZE = 9
+
+
+@wp.kernel
+def estimate_attitude(
+    mask: wp.array[wp.bool],
+    restart: int,
+    angular_velocity: wp.array[wp.vec3],
+    gravity: wp.array[wp.vec3],
+    heading: wp.array2d[wp.float32],
+    control_dt: float,
+    gain: float,
+    attitude: wp.array2d[wp.float32],
+    quat: wp.array[wp.vec4],
+):
+    """One control step of a world's attitude; with ``restart`` the masked worlds begin anew, and the others wait.
+
+    :class:`pace.rl.deployed_memory.AttitudeEstimateStep` does the same in an exported policy.
+    """
+    world = wp.tid()
+    row = attitude[world]
+    if restart == 1 and not mask[world]:
+        return
+    seen, turning = gravity[world], angular_velocity[world]
+    down = wp.normalize(seen)
+    forward = wp.normalize(wp.vec2(heading[world, 0], heading[world, 1]))
+    if restart == 0 and row[SEEN_ONCE] == 1.0:
+        mean = 0.5 * (turning + _position(row, TURNING))
+        last = _position(row, DOWN)
+        down = wp.normalize((1.0 - gain) * (last + control_dt * wp.cross(last, mean)) + gain * seen)
+        angle = control_dt * yaw_rate(down, mean)
+        c, s = wp.cos(angle), wp.sin(angle)
+        x, y = row[FORWARD], row[FORWARD + 1]
+        ahead = (1.0 - gain) * wp.vec2(c * x - s * y, s * x + c * y) + gain * wp.vec2(
+            heading[world, 0], heading[world, 1]
+        )
+        forward = wp.normalize(ahead)
+    row[SEEN_ONCE] = 1.0
+    _keep(row, DOWN, down)
+    row[FORWARD] = forward[0]
+    row[FORWARD + 1] = forward[1]
+    _keep(row, TURNING, turning)
+    quat[world] = orientation(down, forward[0], forward[1])

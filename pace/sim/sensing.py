@@ -64,7 +64,7 @@ def _late(line: wp.array2d[wp.float32], delay: float, column: int) -> float:
 
 
 @wp.func
-def _orientation(gravity: wp.vec3, x: float, y: float) -> wp.vec4:
+def orientation(gravity: wp.vec3, x: float, y: float) -> wp.vec4:
     """Base quaternion w, x, y, z: gravity gives roll and pitch, heading (x, y) gives yaw (R = Rz Ry Rx)."""
     roll = 0.5 * wp.atan2(-gravity[1], -gravity[2])
     pitch = 0.5 * wp.atan2(gravity[0], wp.sqrt(gravity[1] * gravity[1] + gravity[2] * gravity[2]))
@@ -120,7 +120,7 @@ def _sense(
     for column in range(line.shape[2]):
         row[mocap + column] += _late(line[world], delay[world], column)
     gravity = wp.vec3(row[3], row[4], row[5])
-    base_quat[world] = _orientation(gravity, row[mocap + HEADING], row[mocap + HEADING + 1])
+    base_quat[world] = orientation(gravity, row[mocap + HEADING], row[mocap + HEADING + 1])
 
 
 class Sensing:

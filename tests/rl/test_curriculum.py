@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -25,9 +26,8 @@ WIDER = f"curriculum=[{{samples: {2 * UPDATE}, task: ['sensing=wide', 'serve.ser
 
 
 def staged() -> TrainConfig:
-    run = config("sensing=clean", "randomization=none")
-    run.curriculum = [Stage(1e6, ["sensing=paper", "ball=venue"]), Stage(3e6, ["sensing.mocap_delay=[0.0,0.05]"])]
-    return run
+    stages = [Stage(1e6, ["sensing=paper", "ball=venue"]), Stage(3e6, ["sensing.mocap_delay=[0.0,0.05]"])]
+    return replace(config("sensing=clean", "randomization=none"), curriculum=stages)  # type: ignore[return-value]
 
 
 def test_each_stage_changes_the_task_of_the_one_before() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -140,9 +141,8 @@ def test_it_is_part_of_the_state_and_of_the_episode() -> None:
 
 def test_wrong_numbers_are_refused() -> None:
     task = config("observation=memory")
-    task.observation.delay_estimate = None
     with pytest.raises(ConfigError, match=r"give observation\.delay_estimate"):
-        check_policy(task.observation, task.predictor)
+        check_policy(replace(task.observation, delay_estimate=None), task.predictor)
     with pytest.raises(ConfigError, match=r"delay_estimate.smoothing must lie in"):
         config("observation=memory", "observation.delay_estimate.smoothing=nan")
     with pytest.raises(ConfigError, match=r"delay_estimate.prior must not be negative"):

@@ -192,15 +192,16 @@ class Watched:
 def test_a_policy_that_remembers_its_returns(remembering: tuple[Path, TaskPolicy, dict[str, float]]) -> None:
     file, policy, differences = remembering
     assert max(differences.values()) < 1e-4
-    assert list(differences)[-2:] == ["return_memory_next", "delay_estimate_next"]
+    assert list(differences)[-3:] == ["return_memory_next", "delay_estimate_next", "attitude_next"]
     session, meta = open_session(file), stored(file)
     inputs = [port.name for port in session.get_inputs()]
-    assert inputs == list(input_ports(policy.config)) == [*INPUTS, "return_memory", "delay_estimate"]
+    assert inputs == list(input_ports(policy.config)) == [*INPUTS, "return_memory", "delay_estimate", "attitude"]
     assert [port.name for port in session.get_outputs()] == list(output_ports(policy.config))
     assert meta["inputs"]["return_memory"]["shape"] == [5, 24]
     assert meta["inputs"]["delay_estimate"]["shape"] == [5, 8]
     assert meta["kept"]["return_memory"] == "return_memory_next"
     assert meta["kept"]["delay_estimate"] == "delay_estimate_next"
+    assert meta["kept"]["attitude"] == "attitude_next"
 
 
 def test_returns_are_seen_while_it_is_compared(remembering: tuple[Path, TaskPolicy, dict[str, float]]) -> None:
@@ -284,7 +285,7 @@ def test_the_ball_is_followed_as_in_the_task() -> None:
     bit, seen = torch.zeros(worlds, 1), 0
     for _ in range(60):
         new = torch.rand(worlds) < 0.05
-        sensed += torch.tensor([-0.05, 0.0, 0.0]) + 0.04 * torch.randn(worlds, 3)
+        sensed += torch.tensor([-0.05, 0.0, 0.0]) + 0.06 * torch.randn(worlds, 3)
         sensed[new] = torch.tensor([0.0, 0.0, 1.1])
         track.update(sensed, new)
         positions = torch.cat((positions[:, 1:], sensed.unsqueeze(1)), dim=1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -161,9 +163,8 @@ def test_the_critic_sees_the_contact_that_the_ball_has() -> None:
 
 def test_it_needs_its_numbers_and_five_frames() -> None:
     task = config("observation=memory")
-    task.observation.return_memory = None
     with pytest.raises(ConfigError, match="observation=memory"):
-        check_policy(task.observation, task.predictor)
+        check_policy(replace(task.observation, return_memory=None), task.predictor)
     task = config("observation=memory", "predictor.frames=4")
     with pytest.raises(ConfigError, match=r"predictor.frames of 5 or more, got 4"):
         check_policy(task.observation, task.predictor)
