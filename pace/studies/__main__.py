@@ -1,5 +1,6 @@
 """``python -m pace.studies``: engines against each other, step sizes, solver settings, paddle reaction, motors,
-what a predictor can know, how a policy stands, and whether it finds out its paddle (extra ``dev``).
+what a predictor can know, how a policy stands, whether it finds out its paddle, and what it makes of its sensors
+(extra ``dev``).
 
 Prints the tables of ``docs/engines.md``, ``docs/physics.md``, ``docs/predictor.md`` and ``docs/campaign.md`` and writes
 their figures.
@@ -14,8 +15,10 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
 
-from pace.studies import adaptation, motors, parity, posture, predictor, reaction, steps
+from pace.studies import adaptation, motors, parity, posture, predictor, reaction, senses, steps
 from pace.studies.swings import Swings, policy_swings, random_swings
+
+CAMPAIGN = Path("pretrained/campaign")
 
 
 def _save(out: Path, name: str, size: tuple[float, float], draw: Callable[[Figure], None]) -> None:
@@ -74,6 +77,10 @@ def study_adaptation(options: argparse.Namespace) -> None:
     _save(options.out, "adaptation", (11.5, 3.2), lambda figure: adaptation.draw(found, figure))
 
 
+def study_senses(options: argparse.Namespace) -> None:
+    print(senses.table(senses.sense(options.run or CAMPAIGN, options.worlds)))
+
+
 def _policies(options: argparse.Namespace) -> list[Path]:
     kept = sorted(path.parent for path in Path("pretrained").glob("*/checkpoint.json"))
     return [options.run] if options.run else kept
@@ -97,6 +104,7 @@ STUDIES = {
     "predictor": study_predictor,
     "posture": study_posture,
     "adaptation": study_adaptation,
+    "senses": study_senses,
 }
 
 

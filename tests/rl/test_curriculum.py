@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from pace.config import ConfigError, Stage, TrainConfig
+from pace.config import ConfigError, Stage, TrainConfig, load_train_config
 from pace.rl.checkpoint import load_checkpoint
 from pace.rl.curriculum import Curriculum, stage_tasks
 from pace.rl.milestones import read_metrics
@@ -38,7 +38,7 @@ def test_each_stage_changes_the_task_of_the_one_before() -> None:
 
 
 def test_the_campaigns_stages_are_tasks() -> None:
-    tasks = stage_tasks(config("experiment=campaign"))
+    tasks = stage_tasks(load_train_config(["experiment=campaign"]))
     assert [task.sensing.name for task in tasks] == ["paper", "wide", "wide"]
     assert [task.randomization.trunk_mass for task in tasks] == [[-2.0, 2.0], [-4.0, 6.0], [-4.0, 6.0]]
     assert [task.serve.serves_per_episode for task in tasks] == [5, 5, 20]

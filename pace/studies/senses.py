@@ -1,0 +1,92 @@
+"""What a policy's robot knows of its motion capture's delay and of its own orientation, by the time since the reset."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from pace.config import ConfigError
+from pace.rl.env import TableTennisEnv
+from pace.rl.loading import TaskPolicy, load_policy
+from pace.rl.observations import ActorSignals
+from pace.studies.common import ENDLESS, markdown
+
+TIMES = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)  # s since the episode began
+SEED = 5
+#: The paper's noise, and delays that differ by 26 ms.
+TASK = ("sensing=paper", "sensing.mocap_delay=[0.004,0.030]", "randomization=full")
+COLUMNS = ("delay, ms", "gravity sensed, mrad", "estimated", "heading sensed, mrad", "estimated", "paddle sensed, mm",
+           "estimated")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Senses:
+    """Root mean square errors (times, columns) over worlds that play on, in the units of ``COLUMNS``."""
+
+    policy: str
+    errors: Tensor
+
+
+def sense(run: Path, worlds: int) -> Senses:
+    """Play ``worlds`` robots for the longest of ``TIMES``. Errors: :class:`ConfigError` for a policy that estimates
+    neither."""
+    policy = load_policy(run)
+    if policy.config.observation.delay is None or policy.config.observation.attitude is None:
+        raise ConfigError(f"{run} does not observe sensed_delay and estimated_heading: give one of observation=memory")
+    env = policy.make_env(worlds, "cpu", SEED, [*ENDLESS, *TASK])
+    steps = [round(time / env.worlds.control_dt) for time in TIMES]
+    return Senses(run.name, torch.stack(_play(env, policy, steps)))
+
+
+def _play(env: TableTennisEnv, policy: TaskPolicy, steps: Sequence[int]) -> list[Tensor]:
+    rows = []
+    stood = torch.ones(env.num_worlds, dtype=torch.bool)
+    for step in range(1, steps[-1] + 1):
+        env.advance(policy(env.policy_observation))
+        stood &= ~env.terminated  # a fall begins another episode
+        if step in steps:
+            rows.append(torch.stack([error[stood].square().sum(1).mean().sqrt() for error in errors(env)]))
+    return rows
+
+
+def errors(env: TableTennisEnv) -> list[Tensor]:
+    """Each world's error (N, size) of every column, in its unit."""
+    sensing, actor, robot = env.sensing, env.actor, env.worlds.robot
+    observation = env.config.observation
+    assert actor.delay is not None
+    assert actor.attitude is not None
+    assert observation.delay_estimate is not None
+    delay = actor.delay.seen + observation.delay_estimate.prior - (sensing.delay * env.worlds.control_dt).unsqueeze(1)
+    gravity = [given - robot.projected_gravity for given in (sensing.projected_gravity, actor.attitude.gravity)]
+    heading = [_angle(given, robot.heading) for given in (sensing.heading, actor.attitude.heading)]
+    paddle = [position - robot.paddle_position for position in (_sensed_paddle(env, actor), actor.paddle_position)]
+    in_milli = [1e3 * error for pair in (gravity, heading, paddle) for error in pair]
+    return [1e3 * delay, *in_milli]
+
+
+def _angle(given: Tensor, true: Tensor) -> Tensor:
+    across = true[:, 0] * given[:, 1] - true[:, 1] * given[:, 0]
+    return torch.atan2(across, (true * given).sum(1)).unsqueeze(1)
+
+
+def _sensed_paddle(env: TableTennisEnv, actor: ActorSignals) -> Tensor:
+    """(N, 3) m, by forward kinematics from what is sensed alone."""
+    sensing = env.sensing
+    joints = sensing.joint_position + env.worlds.nominal
+    known = actor.paddle_position.clone()  # the kinematics' own tensor may be the actor's
+    sensed = env.worlds.kinematics.paddle_pose(sensing.base_position, sensing.base_quat, joints)[0].clone()
+    actor.paddle_position.copy_(known)
+    return sensed
+
+
+def table(found: Senses) -> str:
+    """One row a time since the reset."""
+    rows = [
+        [f"{time:g} s", *(f"{value:.1f}" for value in row)]
+        for time, row in zip(TIMES, found.errors.tolist(), strict=True)
+    ]
+    return markdown(["since the reset", *COLUMNS], rows)
