@@ -128,7 +128,7 @@ class FlightFilter(nn.Module):
     def forward(self, frames: Tensor) -> Flight:
         """(N, W, 3) m, oldest first, the first position repeated where the flight is shorter."""
         frames = frames.mT.contiguous()
-        ages = self.ages.repeat(len(frames), 1)
+        ages = self.ages.expand(frames.shape[0], -1)
         moved = (frames[..., 1:] != frames[..., :-1]).any(1).to(frames.dtype)
         age = FRAME * moved.sum(1, keepdim=True)
         # before the first low place from which it rises the ball has surely not bounced; at that place it may have

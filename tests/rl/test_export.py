@@ -204,6 +204,12 @@ def test_a_policy_that_remembers_its_returns(remembering: tuple[Path, TaskPolicy
     assert meta["kept"]["attitude"] == "attitude_next"
 
 
+def test_the_filter_of_the_whole_flight_is_exported_for_any_number_of_robots(tmp_path: Path) -> None:
+    pytest.importorskip("onnxscript")
+    policy = fresh_policy(["observation=memory", "predictor=filter"])
+    assert max(export_policy(policy, tmp_path / "policy.onnx", options("check_steps=40")).values()) < 1e-4
+
+
 def test_returns_are_seen_while_it_is_compared(remembering: tuple[Path, TaskPolicy, dict[str, float]]) -> None:
     """Serves are returned in the recorded observations, and what is remembered of them changes the action."""
     file, policy, _ = remembering
