@@ -242,9 +242,7 @@ class SensingConfig:
     base_shift: float  # m
     mocap_delay: Range  # s, drawn per world at reset: ball, base position and heading
     noise_scale: Range = field(default_factory=lambda: [1.0, 1.0])  # of all amplitudes, drawn per world at reset
-    moved: float = (
-        0.03  # m; a ball seen this much further away than two control steps before has turned: no noise does that
-    )
+    moved: float = 0.03  # m; a ball seen so much further away than two control steps before has turned: noise does less
 
     def __post_init__(self) -> None:
         _check_range("sensing.mocap_delay", self.mocap_delay, lowest=0.0)

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 import warp as wp
-from torch import Tensor
 
 from pace.config import AttitudeEstimateConfig
+from pace.rl.estimate import Estimate
 from pace.rl.signal_kernels import ATTITUDE_SIZE, DOWN, FORWARD, TURNING, estimate_attitude
 from pace.sim.sensing import Sensing
-from pace.sim.sharing import record, share
+from pace.sim.sharing import share
 
 
-class AttitudeEstimate:
+class AttitudeEstimate(Estimate):
     """A complementary filter of each world's orientation, as the inertial unit of a robot has it.
 
     Each control step the last estimate is turned on by the gyroscope, and ``gain`` of it is replaced by what is sensed.
@@ -38,19 +36,6 @@ class AttitudeEstimate:
         self.state = torch.zeros(count, ATTITUDE_SIZE, device=device)
         self.gravity, self.heading = self.state[:, DOWN:FORWARD], self.state[:, FORWARD:TURNING]
         self.quat = torch.zeros(count, 4, device=device)
-        self._mask = torch.zeros(count, dtype=torch.bool, device=device)
         sensed = [share(turning), share(sensing.projected_gravity), wp.from_torch(sensing.heading)]
         kept = [wp.from_torch(self.state), wp.from_torch(self.quat, dtype=wp.vec4)]
-        shared = [*sensed, control_dt, config.gain, *kept]
-        mask = share(self._mask)
-        self._update: Callable[[], None] = record(estimate_attitude, count, [mask, 0, *shared], device)
-        self._restart: Callable[[], None] = record(estimate_attitude, count, [mask, 1, *shared], device)
-
-    def update(self) -> None:
-        """One control step later: the sensors' signals are new."""
-        self._update()
-
-    def restart(self, mask: Tensor) -> None:
-        """Begin anew with what is sensed now in the worlds of ``mask`` (N,) bool."""
-        self._mask.copy_(mask)
-        self._restart()
+        super().__init__(estimate_attitude, [*sensed, control_dt, config.gain, *kept], count, device)

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 import warp as wp
-from torch import Tensor
 
 from pace.config import DelayEstimateConfig
+from pace.rl.estimate import Estimate
 from pace.rl.signal_kernels import DELAY_SIZE, DelayRules, estimate_delay
 from pace.sim.sensing import Sensing
-from pace.sim.sharing import record, share
+from pace.sim.sharing import share
 
 
-class DelayEstimate:
+class DelayEstimate(Estimate):
     """The delay of each world's motion capture, from the turns of its trunk since the episode began.
 
     The gyroscope reports a turn at once, motion capture ``delay`` seconds later: yaw(t) = psi(t) - delay * rate(t), as
@@ -40,20 +38,9 @@ class DelayEstimate:
         count, device = turning.shape[0], turning.device
         self.state = torch.zeros(count, DELAY_SIZE, device=device)
         self.seen = self.state[:, -1:]
-        self._mask = torch.zeros(count, dtype=torch.bool, device=device)
         arrays = [share(turning), share(sensing.projected_gravity), wp.from_torch(sensing.heading)]
-        shared = [*arrays, delay_rules(config, control_dt), wp.from_torch(self.state)]
-        self._update: Callable[[], None] = record(estimate_delay, count, [share(self._mask), 0, *shared], device)
-        self._restart: Callable[[], None] = record(estimate_delay, count, [share(self._mask), 1, *shared], device)
-
-    def update(self) -> None:
-        """One control step later: the sensors' signals are new."""
-        self._update()
-
-    def restart(self, mask: Tensor) -> None:
-        """Forget everything in the worlds of ``mask`` (N,) bool, and begin with what they sense now."""
-        self._mask.copy_(mask)
-        self._restart()
+        inputs = [*arrays, delay_rules(config, control_dt), wp.from_torch(self.state)]
+        super().__init__(estimate_delay, inputs, count, device)
 
 
 def delay_rules(config: DelayEstimateConfig, control_dt: float) -> DelayRules:

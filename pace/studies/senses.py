@@ -12,7 +12,6 @@ from torch import Tensor
 from pace.config import ConfigError
 from pace.rl.env import TableTennisEnv
 from pace.rl.loading import TaskPolicy, load_policy
-from pace.rl.observations import ActorSignals
 from pace.studies.common import ENDLESS, markdown
 
 TIMES = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)  # s since the episode began
@@ -63,7 +62,7 @@ def errors(env: TableTennisEnv) -> list[Tensor]:
     delay = actor.delay.seen + observation.delay_estimate.prior - (sensing.delay * env.worlds.control_dt).unsqueeze(1)
     gravity = [given - robot.projected_gravity for given in (sensing.projected_gravity, actor.attitude.gravity)]
     heading = [_angle(given, robot.heading) for given in (sensing.heading, actor.attitude.heading)]
-    paddle = [position - robot.paddle_position for position in (_sensed_paddle(env, actor), actor.paddle_position)]
+    paddle = [position - robot.paddle_position for position in (_sensed_paddle(env), actor.paddle_position)]
     in_milli = [1e3 * error for pair in (gravity, heading, paddle) for error in pair]
     return [1e3 * delay, *in_milli]
 
@@ -73,14 +72,11 @@ def _angle(given: Tensor, true: Tensor) -> Tensor:
     return torch.atan2(across, (true * given).sum(1)).unsqueeze(1)
 
 
-def _sensed_paddle(env: TableTennisEnv, actor: ActorSignals) -> Tensor:
+def _sensed_paddle(env: TableTennisEnv) -> Tensor:
     """(N, 3) m, by forward kinematics from what is sensed alone."""
     sensing = env.sensing
     joints = sensing.joint_position + env.worlds.nominal
-    known = actor.paddle_position.clone()  # the kinematics' own tensor may be the actor's
-    sensed = env.worlds.kinematics.paddle_pose(sensing.base_position, sensing.base_quat, joints)[0].clone()
-    actor.paddle_position.copy_(known)
-    return sensed
+    return env.worlds.kinematics.paddle_pose(sensing.base_position, sensing.base_quat, joints)[0]
 
 
 def table(found: Senses) -> str:
