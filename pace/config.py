@@ -390,8 +390,9 @@ class AlgoConfig:
     max_grad_norm: float
     observation_clip: float
     last_layer_gain: float
-    autocast: str  # auto (bf16 where the hardware has it), bf16, fp32
+    autocast: str  # auto (bf16 where the hardware has it, down to fp32_below), bf16, fp32
     later_steps: list[SchedulePoint] = field(default_factory=list)  # in place of steps from that many control steps on
+    fp32_below: float = 0.0  # mean std of the policy below which autocast=auto computes in float32
 
     def steps_at(self, samples: float) -> int:
         """Control steps a world plays per update, ``samples`` control steps into the run."""
@@ -403,6 +404,7 @@ class AlgoConfig:
             whole = point.value >= 1 and point.value == int(point.value)
             _require(whole, f"algo.later_steps: {point.value} is no number of steps")
         _require(self.autocast in ("auto", "bf16", "fp32"), "algo.autocast must be auto, bf16 or fp32")
+        _require(self.fp32_below >= 0, "algo.fp32_below is a standard deviation: it cannot be negative")
         _require(0 < self.gamma <= 1, "algo.gamma must lie in (0, 1]")
         for name in ("steps", "epochs", "minibatches"):
             _require(getattr(self, name) >= 1, f"algo.{name} must be at least 1")

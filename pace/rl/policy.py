@@ -191,13 +191,23 @@ class Agent(nn.Module):
         super().__init__()
         if config.std_floor > min(point.value for point in config.std):
             raise ConfigError(f"algo.std_floor {config.std_floor} is above a value of the algo.std schedule")
-        self.observation_dtype = compute_dtype(config.autocast, device)
+        self.fast_dtype = self.observation_dtype = compute_dtype(config.autocast, device)
+        self.fp32_below = config.fp32_below if config.autocast == "auto" else 0.0
         self.num_actions = actions
         self.policy_norm = RunningNorm(policy_size, config.observation_clip)
         self.critic_norm = RunningNorm(critic_size, config.observation_clip)
         self.actor = GaussianActor(policy_size, actions, config, self.observation_dtype)
         self.critic = MLP(critic_size, config.critic_hidden, 1, 1.0, self.observation_dtype)
         self.to(device)
+
+    def choose_dtype(self) -> None:
+        """Compute in float32 once the policy's spread is so small that rounding to bf16 is a good part of it.
+
+        What is rounded differs with every change of the weights: the KL divergence of an update then measures the
+        rounding, and the learning rate, which follows it, falls to its floor.
+        """
+        fine = self.actor.std.mean().item() < self.fp32_below
+        self.observation_dtype = self.actor.mlp.dtype = self.critic.dtype = torch.float32 if fine else self.fast_dtype
 
     def actor_operator(self) -> ProbabilisticTensorDictSequential:
         """The actor as TorchRL sees it: normalised ``policy`` -> ``loc``, ``scale`` -> ``action``."""

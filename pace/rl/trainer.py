@@ -204,9 +204,11 @@ class Trainer:
             self.env = self.curriculum.worlds
 
     def _fit_storage(self) -> None:
-        """Make room for the present worlds and as many steps as the next update is to have (``algo.later_steps``)."""
+        """Room for the present worlds, the steps of the next update (``algo.later_steps``), and its number format."""
         steps = self.config.algo.steps_at(self.samples)
-        if steps != self.rollout.steps or self.env is not self.rollout.env:
+        self.agent.choose_dtype()
+        fits = steps == self.rollout.steps and self.rollout.policy.dtype == self.agent.observation_dtype
+        if not fits or self.env is not self.rollout.env:
             self.rollout = Rollout(self.env, self.agent, steps)
             self.regression.resize(steps)
 
@@ -288,6 +290,7 @@ class Trainer:
                 cure = "; predictor_from=RUN takes another run's" if part == "predictor" else ""
                 load_weights(module, checkpoint.weights[part], f"{checkpoint.path} ({part}{cure})")
         self.agent.actor.bound_std(self.config.algo.std_floor, self.config.algo.std[0].value)
+        self.agent.choose_dtype()
 
     def resume(self, checkpoint: Checkpoint) -> None:
         """Go on exactly where ``checkpoint`` was written.

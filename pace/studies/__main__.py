@@ -1,6 +1,6 @@
 """``python -m pace.studies``: engines against each other, step sizes, solver settings, paddle reaction, motors,
-what a predictor can know, how a policy stands, whether it finds out its paddle, and what it makes of its sensors
-(extra ``dev``).
+what a predictor can know, how a policy stands, whether it finds out its paddle, what it makes of its sensors, and what
+rounding to bf16 does to its learning (extra ``dev``).
 
 Prints the tables of ``docs/engines.md``, ``docs/physics.md``, ``docs/predictor.md`` and ``docs/campaign.md`` and writes
 their figures.
@@ -15,7 +15,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
 
-from pace.studies import adaptation, motors, parity, posture, predictor, reaction, senses, steps
+from pace.studies import adaptation, motors, parity, posture, predictor, reaction, rounding, senses, steps
 from pace.studies.swings import Swings, policy_swings, random_swings
 
 CAMPAIGN = Path("pretrained/campaign")
@@ -81,6 +81,10 @@ def study_senses(options: argparse.Namespace) -> None:
     print(senses.table(senses.sense(options.run or CAMPAIGN, options.worlds)))
 
 
+def study_rounding(options: argparse.Namespace) -> None:
+    print(rounding.table(rounding.measure(options.run or CAMPAIGN, options.worlds)))
+
+
 def _policies(options: argparse.Namespace) -> list[Path]:
     kept = sorted(path.parent for path in Path("pretrained").glob("*/checkpoint.json"))
     return [options.run] if options.run else kept
@@ -105,6 +109,7 @@ STUDIES = {
     "posture": study_posture,
     "adaptation": study_adaptation,
     "senses": study_senses,
+    "rounding": study_rounding,
 }
 
 

@@ -116,6 +116,19 @@ def test_compute_dtype_follows_the_request() -> None:
     assert compute_dtype("auto", CPU) in (torch.float32, torch.bfloat16)
 
 
+def test_bf16_is_left_where_its_rounding_is_a_good_part_of_the_spread(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: True)
+    agent = Agent(6, 7, 2, small_algo(autocast="auto", fp32_below=0.2), CPU)
+    for std, dtype in ((0.3, torch.bfloat16), (0.1, torch.float32), (0.3, torch.bfloat16)):
+        agent.actor.bound_std(std, std)
+        agent.choose_dtype()
+        assert agent.observation_dtype == agent.actor.mlp.dtype == agent.critic.dtype == dtype
+    asked = Agent(6, 7, 2, small_algo(autocast="bf16", fp32_below=0.2), CPU)
+    asked.actor.bound_std(0.05, 0.05)
+    asked.choose_dtype()
+    assert asked.observation_dtype == torch.bfloat16  # as asked for
+
+
 def test_deterministic_policy_is_the_mean_action_of_the_agent() -> None:
     config = small_algo()
     agent = Agent(6, 7, 2, config, CPU)

@@ -134,3 +134,16 @@ def test_state_restores_the_optimisers() -> None:
         learner.update(rollout, 0)
     for mine, theirs in zip(agent.parameters(), twin_agent.parameters(), strict=True):
         assert torch.equal(mine, theirs)
+
+
+def test_at_a_small_spread_the_kl_of_bf16_networks_is_rounding() -> None:
+    """Why ``algo.fp32_below`` is there: weights that hardly move, and a KL divergence that the number format makes."""
+    kl = {}
+    for autocast in ("bf16", "fp32"):
+        config = small_algo(
+            autocast=autocast, std=[SchedulePoint(0.0, 0.05)], learning_rate=1e-8, learning_rate_min=1e-8,
+            learning_rate_max=1e-8, last_layer_gain=1.0, actor_hidden=[256, 128],
+        )  # fmt: skip
+        agent, rollout = played(config)
+        kl[autocast] = PPO(agent, config).update(rollout, 0)["kl"]
+    assert 0 < kl["fp32"] < 0.1 * kl["bf16"]

@@ -125,6 +125,27 @@ def test_later_updates_can_be_longer_and_resume_exactly(tmp_path: Path) -> None:
         replace(make_config().algo, later_steps=[SchedulePoint(0.0, 1.5)])
 
 
+def test_a_run_changes_to_float32_when_its_spread_is_small_and_resumes_exactly(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: True)
+    std = [SchedulePoint(0.0, 0.5), SchedulePoint(2.0 * UPDATE, 0.1)]
+
+    def narrowing(path: Path, updates: int, resume: bool = False) -> Trainer:
+        algo = replace(make_config().algo, autocast="auto", fp32_below=0.2, std=std)
+        trainer = make_trainer(path, updates, resume, algo=algo)
+        assert trainer.agent.observation_dtype == (torch.float32 if resume else torch.bfloat16)
+        trainer.train()
+        return trainer
+
+    whole = narrowing(tmp_path / "whole", 5)
+    assert whole.rollout.policy.dtype == torch.float32
+    narrowing(tmp_path / "parts", 4)
+    resumed = narrowing(tmp_path / "parts", 5, resume=True)
+    expected, found = all_weights(whole), all_weights(resumed)
+    assert all(torch.equal(expected[name], found[name]) for name in expected)
+
+
 def test_rows_after_the_checkpoint_are_replaced_by_a_resume(tmp_path: Path) -> None:
     make_trainer(tmp_path, updates=2).train()
     with (tmp_path / "metrics.csv").open("a") as file:
