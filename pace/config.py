@@ -296,6 +296,21 @@ class AttitudeEstimateConfig:
 
 
 @dataclass
+class JointEstimateConfig:
+    """How the robot knows its joints better than its encoders (:class:`pace.rl.joints.JointEstimate`)."""
+
+    acceleration: float  # rad/s^2, root mean square over a control step
+    position_noise: float  # rad, root mean square, of what is sensed
+    velocity_noise: float  # rad/s, the same
+
+    def __post_init__(self) -> None:
+        for name in ("acceleration", "position_noise", "velocity_noise"):
+            value = getattr(self, name)
+            good = 0 < value < math.inf
+            _require(good, f"observation.joint_estimate.{name} must be positive and finite, got {value}")
+
+
+@dataclass
 class ObservationConfig:
     """Names of the observations of each network, in order, and how many control steps of history each sees."""
 
@@ -308,6 +323,8 @@ class ObservationConfig:
     delay_estimate: DelayEstimateConfig | None = None  # needed by the observation sensed_delay
     # needed by the observations estimated_gravity and estimated_heading; with them it gives the paddle's pose too
     attitude_estimate: AttitudeEstimateConfig | None = None
+    # needed by the observations estimated_joint_position and estimated_joint_velocity; likewise
+    joint_estimate: JointEstimateConfig | None = None
 
     @property
     def memory(self) -> ReturnMemoryConfig | None:
@@ -323,6 +340,12 @@ class ObservationConfig:
     def attitude(self) -> AttitudeEstimateConfig | None:
         """Numbers of the filter of the orientation, where the policy observes it."""
         return self.attitude_estimate if {"estimated_gravity", "estimated_heading"} & set(self.policy) else None
+
+    @property
+    def joints(self) -> JointEstimateConfig | None:
+        """Numbers of the filter of the joints, where the policy observes it."""
+        observed = {"estimated_joint_position", "estimated_joint_velocity"} & set(self.policy)
+        return self.joint_estimate if observed else None
 
     def __post_init__(self) -> None:
         _require(self.policy_history >= 1, "observation.policy_history must be at least 1")

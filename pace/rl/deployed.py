@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from pace.config import TaskConfig
 from pace.predictor.network import PredictorNetwork
-from pace.rl.deployed_memory import AttitudeEstimateStep, DelayEstimateStep, ReturnMemoryStep
+from pace.rl.deployed_memory import AttitudeEstimateStep, DelayEstimateStep, JointEstimateStep, ReturnMemoryStep
 from pace.rl.loading import TaskPolicy
 from pace.rl.memory import SEEN
 from pace.rl.observations import JOINTS, check_policy
@@ -101,6 +101,19 @@ ATTITUDE_OUTPUTS = {
         "kept by the caller as attitude of the next call: 1, estimated gravity and heading, angular velocity",
     ),
 }
+#: Inputs and outputs besides, of a policy that observes ``estimated_joint_position`` or ``estimated_joint_velocity``.
+JOINTS_INPUTS = {
+    "joints": Port(
+        1 + 2 * JOINTS, "1, rad, rad/s", "the output joints_next of the calls before; zeros before the first one"
+    ),
+}
+JOINTS_OUTPUTS = {
+    "joints_next": Port(
+        1 + 2 * JOINTS,
+        "1, rad, rad/s",
+        "kept by the caller as joints of the next call: 1, estimated positions above the nominal pose, velocities",
+    ),
+}
 #: Input -> the output of the calls before that it is made of. An ONNX graph has one name space, hence the other names.
 KEPT = {
     "previous_action": "action",
@@ -108,26 +121,30 @@ KEPT = {
     "return_memory": "return_memory_next",
     "delay_estimate": "delay_estimate_next",
     "attitude": "attitude_next",
+    "joints": "joints_next",
 }
 
 
 def input_ports(config: TaskConfig) -> dict[str, Port]:
     """The policy's inputs, in order."""
-    return INPUTS | _of_those_kept(config, MEMORY_INPUTS, DELAY_INPUTS, ATTITUDE_INPUTS)
+    return INPUTS | _of_those_kept(config, MEMORY_INPUTS, DELAY_INPUTS, ATTITUDE_INPUTS, JOINTS_INPUTS)
 
 
 def output_ports(config: TaskConfig) -> dict[str, Port]:
     """The policy's outputs, in order."""
-    return OUTPUTS | _of_those_kept(config, MEMORY_OUTPUTS, DELAY_OUTPUTS, ATTITUDE_OUTPUTS)
+    return OUTPUTS | _of_those_kept(config, MEMORY_OUTPUTS, DELAY_OUTPUTS, ATTITUDE_OUTPUTS, JOINTS_OUTPUTS)
 
 
-def _of_those_kept(
-    config: TaskConfig, memory: dict[str, Port], delay: dict[str, Port], attitude: dict[str, Port]
-) -> dict[str, Port]:
-    observation = config.observation
-    ports = memory if observation.memory else {}
-    ports = ports | (delay if observation.delay else {})
-    return ports | (attitude if observation.attitude else {})
+def _of_those_kept(config: TaskConfig, *ports: dict[str, Port]) -> dict[str, Port]:
+    """Those of the ``ports`` of memory, delay, attitude and joints that the policy observes."""
+    seen = config.observation
+    observed = (seen.memory, seen.delay, seen.attitude, seen.joints)
+    return {
+        name: port
+        for numbers, part in zip(observed, ports, strict=True)
+        if numbers is not None
+        for name, port in part.items()
+    }
 
 
 def kept_outputs(config: TaskConfig) -> dict[str, str]:
@@ -329,6 +346,8 @@ class DeployedPolicy(nn.Module):
         self.delay = DelayEstimateStep(numbers, config.robot.control_dt) if numbers else None
         numbers = config.observation.attitude
         self.attitude = AttitudeEstimateStep(numbers, config.robot.control_dt) if numbers else None
+        numbers = config.observation.joints
+        self.joints = JointEstimateStep(numbers, config.robot.control_dt) if numbers else None
         self.kept = [name for name in input_ports(config) if name not in INPUTS]
         self.names = list(config.observation.policy)
         self.action_scale, self.action_clip = config.robot.action_scale, config.robot.action_clip
@@ -360,7 +379,13 @@ class DeployedPolicy(nn.Module):
             new["attitude"] = self.attitude(past["attitude"][:, -1], *sensed)
             down, ahead = _since_first(_with_newest(past["attitude"], new["attitude"]))[..., 1:6].split([3, 2], dim=-1)
         rotation = base_rotation(down, ahead)
-        paddle, normal = self.chain(base_position, rotation, joint_position)
+        bent = joint_position - self.nominal
+        turning = joint_velocity
+        if self.joints is not None:
+            new["joints"] = self.joints(past["joints"][:, -1], bent[:, -1], turning[:, -1])
+            known = _since_first(_with_newest(past["joints"], new["joints"]))[..., 1:]
+            bent, turning = known.split(bent.shape[-1], dim=-1)
+        paddle, normal = self.chain(base_position, rotation, bent + self.nominal)
         frames = {
             "base_angular_velocity": base_angular_velocity,
             "base_position": base_position,
@@ -379,6 +404,8 @@ class DeployedPolicy(nn.Module):
         }
         if self.attitude is not None:
             frames |= {"estimated_gravity": down, "estimated_heading": ahead}
+        if self.joints is not None:
+            frames |= {"estimated_joint_position": bent, "estimated_joint_velocity": turning}
         if self.memory is not None:
             hit = (tracks[:, -1], moved_away[:, -1:], paddle[:, -1], normal[:, -1])
             new["return_memory"] = self.memory(past["return_memory"][:, -1], *hit)

@@ -1,6 +1,6 @@
 """What a robot keeps over an episode, in torch, for exported policies.
 
-See :mod:`pace.rl.memory`, :mod:`pace.rl.delay` and :mod:`pace.rl.attitude`.
+See :mod:`pace.rl.memory`, :mod:`pace.rl.delay`, :mod:`pace.rl.attitude` and :mod:`pace.rl.joints`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from pace.config import AttitudeEstimateConfig, DelayEstimateConfig, ReturnMemoryConfig
+from pace.config import AttitudeEstimateConfig, DelayEstimateConfig, JointEstimateConfig, ReturnMemoryConfig
+from pace.rl.joints import steady_gain
 from pace.rl.signal_kernels import AGE, BEFORE, NORMAL_1, POSITION_1, POSITION_2, RETURN, SMALLEST_TILT
 from pace.sim.aero import GRAVITY
 
@@ -135,3 +136,30 @@ class AttitudeEstimateStep(nn.Module):
         down, ahead = torch.where(seen, down, gravity), torch.where(seen, ahead, heading)
         parts = (functional.normalize(down, dim=1), functional.normalize(ahead, dim=1), angular_velocity)
         return torch.cat((torch.ones_like(known), *parts), dim=1)
+
+
+class JointEstimateStep(nn.Module):
+    """One control step of the filter, as the kernel :func:`pace.rl.signal_kernels.estimate_joints` computes it.
+
+    Args: config: numbers of the filter; control_dt: s.
+    """
+
+    def __init__(self, config: JointEstimateConfig, control_dt: float) -> None:
+        super().__init__()
+        self.control_dt = control_dt
+        (self.near, self.nudge), (self.pull, self.follow) = steady_gain(config, control_dt).tolist()
+
+    def forward(self, kept: Tensor, position: Tensor, velocity: Tensor) -> Tensor:
+        """What is kept (N, 1 + 2 J) after this step: 1, positions, velocities.
+
+        Args: kept (N, 1 + 2 J) before it, zeros at first; position (N, J) rad, relative to the nominal pose, and
+        velocity (N, J) rad/s, both as sensed.
+        """
+        count = position.shape[1]
+        known, last, speed = kept.split([1, count, count], dim=1)
+        said = last + self.control_dt * speed
+        off, faster = position - said, velocity - speed
+        seen = known > 0.5
+        at = torch.where(seen, said + self.near * off + self.nudge * faster, position)
+        moving = torch.where(seen, speed + self.pull * off + self.follow * faster, velocity)
+        return torch.cat((torch.ones_like(known), at, moving), dim=1)

@@ -266,7 +266,7 @@ class TableTennisEnv(EnvBase):
         return sums | {f"reward/{name}": value for name, value in terms.items()}
 
     def _parts(self) -> dict[str, object]:
-        kept = {"memory": self.actor.memory, "delay": self.actor.delay, "attitude": self.actor.attitude}
+        kept = {name: getattr(self.actor, name) for name in ("memory", "delay", "attitude", "joints")}
         return {name: part for name, part in kept.items() if part is not None} | {
             "state": self.task_state,
             "sensing": self.sensing,

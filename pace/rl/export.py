@@ -306,6 +306,8 @@ def expected_outputs(env: TableTennisEnv, policy: TaskPolicy, action: Tensor) ->
         outputs["delay_estimate_next"] = actor.delay.state
     if actor.attitude is not None:
         outputs["attitude_next"] = actor.attitude.state
+    if actor.joints is not None:
+        outputs["joints_next"] = actor.joints.state
     return outputs
 
 

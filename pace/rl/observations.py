@@ -21,6 +21,7 @@ from pace.config import ConfigError, ObservationConfig, PredictorConfig, ReturnM
 from pace.predictor.network import OUTPUT_SIZES, predictor_slices
 from pace.rl.attitude import AttitudeEstimate
 from pace.rl.delay import DelayEstimate
+from pace.rl.joints import JointEstimate
 from pace.rl.memory import SEEN, ReturnMemory
 from pace.rl.signal_kernels import PredictionLayout, SignalArrays, fill_frames, follow_ball, read_prediction
 from pace.rl.state import TaskState
@@ -95,8 +96,8 @@ class ActorSignals:
     Attributes, besides ``sensing`` and ``track``: ``action`` (N, J) the previous action, ``apex``, ``target``
     (N, 3) m predicted, ``time`` (N,) s until the ball is at the target, ``shift`` (N, 2) m from the sensed base to
     where it should stand, ``paddle_position`` (N, 3) m, ``paddle_normal`` (N, 3), ``prediction`` (N, P) raw output;
-    ``memory`` of its returns and ``delay`` of its motion capture, or ``None``: see :meth:`remember`; ``attitude``, the
-    estimated orientation that the paddle's pose is computed with, or ``None``: the sensed one.
+    ``memory`` of its returns and ``delay`` of its motion capture, or ``None``: see :meth:`remember`; ``attitude`` and
+    ``joints``, the estimates that the paddle's pose is computed with, or ``None``: what is sensed.
 
     Args:
         sensing: the robot's sensors.
@@ -139,6 +140,9 @@ class ActorSignals:
         attitude = observation.attitude if observation else None
         self.attitude = AttitudeEstimate(attitude, rules.control_dt, sensing) if attitude else None
         self._base_quat = self.attitude.quat if self.attitude else sensing.base_quat
+        joints = observation.joints if observation else None
+        self.joints = JointEstimate(joints, rules.control_dt, sensing) if joints else None
+        self._joint_offset = self.joints.position if self.joints else sensing.joint_position
 
     def _record(self, slices: dict[str, slice], rules: Rules) -> Callable[[], None]:
         columns = PredictionLayout()
@@ -174,9 +178,10 @@ class ActorSignals:
         ``changed`` (N,) bool: the worlds in which an episode begins; the others stay. ``None``: all go on.
         """
         sensing = self.sensing
-        if self.attitude is not None:
-            self.attitude.update() if changed is None else self.attitude.restart(changed)
-        torch.add(sensing.joint_position, self._nominal, out=self._joints)
+        for estimate in (self.attitude, self.joints):
+            if estimate is not None:
+                estimate.update() if changed is None else estimate.restart(changed)
+        torch.add(self._joint_offset, self._nominal, out=self._joints)
         centre, normal = self._kinematics.paddle_pose(sensing.base_position, self._base_quat, self._joints, changed)
         self.paddle_position.copy_(centre)
         self.paddle_normal.copy_(normal)
@@ -222,6 +227,11 @@ def _attitude(signals: ActorSignals) -> AttitudeEstimate:
     return signals.attitude
 
 
+def _joints(signals: ActorSignals) -> JointEstimate:
+    assert signals.joints is not None  # check_policy has seen to it
+    return signals.joints
+
+
 def _column(values: Tensor) -> Tensor:
     return values.unsqueeze(-1)
 
@@ -246,6 +256,8 @@ POLICY: dict[str, ActorObservation] = {
     "sensed_delay": ActorObservation(1, _sensed_delay),
     "estimated_gravity": ActorObservation(3, lambda s: _attitude(s).gravity),
     "estimated_heading": ActorObservation(2, lambda s: _attitude(s).heading),
+    "estimated_joint_position": ActorObservation(JOINTS, lambda s: _joints(s).position),
+    "estimated_joint_velocity": ActorObservation(JOINTS, lambda s: _joints(s).velocity),
 }
 
 #: What the critic can see: the truth.
@@ -278,6 +290,13 @@ CRITIC: dict[str, CriticObservation] = {
     "mocap_delay": CriticObservation(1, lambda s: _column(s.mocap_delay)),
 }
 
+#: Numbers of the configuration that observations of the actor need.
+ESTIMATES = {
+    "attitude_estimate": ("estimated_gravity", "estimated_heading"),
+    "joint_estimate": ("estimated_joint_position", "estimated_joint_velocity"),
+    "delay_estimate": ("sensed_delay",),
+}
+
 Table = Mapping[str, ActorObservation] | Mapping[str, CriticObservation]
 
 
@@ -292,13 +311,10 @@ def check_policy(observation: ObservationConfig, predictor: PredictorConfig) -> 
             )
         if predictor.frames < 5:
             raise ConfigError(f"observation 'last_return' needs predictor.frames of 5 or more, got {predictor.frames}")
-    if {"estimated_gravity", "estimated_heading"} & set(names) and observation.attitude_estimate is None:
-        raise ConfigError(
-            "observation.policy has 'estimated_gravity' or 'estimated_heading': give observation.attitude_estimate "
-            "(observation=memory)"
-        )
-    if "sensed_delay" in names and observation.delay_estimate is None:
-        raise ConfigError("observation.policy has 'sensed_delay': give observation.delay_estimate (observation=memory)")
+    for needed, observed in ESTIMATES.items():
+        asked = [name for name in observed if name in names]
+        if asked and getattr(observation, needed) is None:
+            raise ConfigError(f"observation.policy has '{asked[0]}': give observation.{needed} (observation=memory)")
     if "predicted_time" in names and predictor.enabled and "target_time" not in predictor.outputs:
         raise ConfigError("observation.policy has 'predicted_time': add 'target_time' to predictor.outputs")
 

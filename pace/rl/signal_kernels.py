@@ -315,3 +315,38 @@ def estimate_attitude(
     row[FORWARD + 1] = forward[1]
     _keep(row, TURNING, turning)
     quat[world] = orientation(down, forward[0], forward[1])
+
+
+#: Column of a world's joints where the positions begin, the velocities after them; before it, 1 once anything was seen.
+FIRST_JOINT = wp.constant(1)
+
+
+@wp.kernel
+def estimate_joints(
+    mask: wp.array[wp.bool],
+    restart: int,
+    position: wp.array2d[wp.float32],
+    velocity: wp.array2d[wp.float32],
+    control_dt: float,
+    gain: wp.mat22,
+    estimate: wp.array2d[wp.float32],
+):
+    """One control step of a world's joints; with ``restart`` the masked worlds begin anew, and the others wait.
+
+    :class:`pace.rl.deployed_memory.JointEstimateStep` does the same in an exported policy.
+    """
+    world = wp.tid()
+    row = estimate[world]
+    if restart == 1 and not mask[world]:
+        return
+    share = gain  # of what is sensed; all of it at first
+    if restart == 1 or row[0] != 1.0:
+        share = wp.identity(2, dtype=wp.float32)
+    row[0] = 1.0
+    count = position.shape[1]
+    for joint in range(count):
+        speed = wp.float32(row[FIRST_JOINT + count + joint])
+        said = row[FIRST_JOINT + joint] + control_dt * speed
+        learned = share * wp.vec2(position[world, joint] - said, velocity[world, joint] - speed)
+        row[FIRST_JOINT + joint] = said + learned[0]
+        row[FIRST_JOINT + count + joint] = speed + learned[1]

@@ -1,4 +1,4 @@
-"""What a policy's robot knows of its motion capture's delay and of its own orientation, by the time since the reset."""
+"""What a policy's robot knows of its motion capture's delay and of its own pose, by the time since the reset."""
 
 from __future__ import annotations
 
@@ -18,8 +18,11 @@ TIMES = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)  # s since the episode began
 SEED = 5
 #: The paper's noise, and delays that differ by 26 ms.
 TASK = ("sensing=paper", "sensing.mocap_delay=[0.004,0.030]", "randomization=full")
-COLUMNS = ("delay, ms", "gravity sensed, mrad", "estimated", "heading sensed, mrad", "estimated", "paddle sensed, mm",
-           "estimated")  # fmt: skip
+COLUMNS = (
+    "delay, ms", "gravity sensed, mrad", "estimated", "heading sensed, mrad", "estimated", "joints sensed, mrad",
+    "estimated", "joints sensed, rad/s", "estimated", "paddle sensed, mm", "estimated",
+)  # fmt: skip
+NEEDED = ("delay", "attitude", "joints")
 
 
 @dataclass(frozen=True)
@@ -31,11 +34,11 @@ class Senses:
 
 
 def sense(run: Path, worlds: int) -> Senses:
-    """Play ``worlds`` robots for the longest of ``TIMES``. Errors: :class:`ConfigError` for a policy that estimates
-    neither."""
+    """Play ``worlds`` robots for the longest of ``TIMES``. Errors: :class:`ConfigError` for a policy that does not
+    estimate them."""
     policy = load_policy(run)
-    if policy.config.observation.delay is None or policy.config.observation.attitude is None:
-        raise ConfigError(f"{run} does not observe sensed_delay and estimated_heading: give one of observation=memory")
+    if any(getattr(policy.config.observation, name) is None for name in NEEDED):
+        raise ConfigError(f"{run} does not observe its delay, orientation and joints: give one of observation=memory")
     env = policy.make_env(worlds, "cpu", SEED, [*ENDLESS, *TASK])
     steps = [round(time / env.worlds.control_dt) for time in TIMES]
     return Senses(run.name, torch.stack(_play(env, policy, steps)))
@@ -53,18 +56,24 @@ def _play(env: TableTennisEnv, policy: TaskPolicy, steps: Sequence[int]) -> list
 
 
 def errors(env: TableTennisEnv) -> list[Tensor]:
-    """Each world's error (N, size) of every column, in its unit."""
+    """Each world's error (N, size) of every column, in its unit; their norms count."""
     sensing, actor, robot = env.sensing, env.actor, env.worlds.robot
     observation = env.config.observation
     assert actor.delay is not None
     assert actor.attitude is not None
+    assert actor.joints is not None
     assert observation.delay_estimate is not None
     delay = actor.delay.seen + observation.delay_estimate.prior - (sensing.delay * env.worlds.control_dt).unsqueeze(1)
     gravity = [given - robot.projected_gravity for given in (sensing.projected_gravity, actor.attitude.gravity)]
     heading = [_angle(given, robot.heading) for given in (sensing.heading, actor.attitude.heading)]
+    joints = robot.joint_position - env.worlds.nominal
+    bent = [given - joints for given in (sensing.joint_position, actor.joints.position)]
+    moving = [given - robot.joint_velocity for given in (sensing.joint_velocity, actor.joints.velocity)]
+    each = sensing.joint_position.shape[1] ** -0.5  # of one joint
     paddle = [position - robot.paddle_position for position in (_sensed_paddle(env), actor.paddle_position)]
-    in_milli = [1e3 * error for pair in (gravity, heading, paddle) for error in pair]
-    return [1e3 * delay, *in_milli]
+    in_milli = [[1e3 * error for error in pair] for pair in (gravity, heading, bent, paddle)]
+    pairs = [in_milli[0], in_milli[1], [each * error for error in in_milli[2]], [each * error for error in moving]]
+    return [1e3 * delay, *(error for pair in (*pairs, in_milli[3]) for error in pair)]
 
 
 def _angle(given: Tensor, true: Tensor) -> Tensor:
@@ -82,7 +91,7 @@ def _sensed_paddle(env: TableTennisEnv) -> Tensor:
 def table(found: Senses) -> str:
     """One row a time since the reset."""
     rows = [
-        [f"{time:g} s", *(f"{value:.1f}" for value in row)]
+        [f"{time:g} s", *(f"{value:.2f}" if value < 2.0 else f"{value:.1f}" for value in row)]
         for time, row in zip(TIMES, found.errors.tolist(), strict=True)
     ]
     return markdown(["since the reset", *COLUMNS], rows)

@@ -59,8 +59,9 @@ def remembering_policy(weight: float = 0.01) -> TaskPolicy:
     config = replace(old.config, observation=load_train_config(["observation=memory"]).observation)
     frame, history = config.observation.policy, config.observation.policy_history
     new = ("last_return", "sensed_delay")
-    kept = [name.replace("estimated_gravity", "projected_gravity") for name in frame if name not in new]
-    assert [name.replace("estimated_heading", "heading") for name in kept] == old.config.observation.policy
+    sensed = {"estimated_gravity": "projected_gravity"}  # and the others by the same name
+    kept = [sensed.get(name, name.removeprefix("estimated_")) for name in frame if name not in new]
+    assert kept == old.config.observation.policy
     old_columns = torch.ones(policy_size(config) // history, dtype=torch.bool)
     for name in new:
         old_columns[layout(frame, POLICY)[name]] = False

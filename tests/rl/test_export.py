@@ -192,16 +192,19 @@ class Watched:
 def test_a_policy_that_remembers_its_returns(remembering: tuple[Path, TaskPolicy, dict[str, float]]) -> None:
     file, policy, differences = remembering
     assert max(differences.values()) < 1e-4
-    assert list(differences)[-3:] == ["return_memory_next", "delay_estimate_next", "attitude_next"]
+    assert list(differences)[-4:] == ["return_memory_next", "delay_estimate_next", "attitude_next", "joints_next"]
     session, meta = open_session(file), stored(file)
     inputs = [port.name for port in session.get_inputs()]
-    assert inputs == list(input_ports(policy.config)) == [*INPUTS, "return_memory", "delay_estimate", "attitude"]
+    kept = ["return_memory", "delay_estimate", "attitude", "joints"]
+    assert inputs == list(input_ports(policy.config)) == [*INPUTS, *kept]
     assert [port.name for port in session.get_outputs()] == list(output_ports(policy.config))
     assert meta["inputs"]["return_memory"]["shape"] == [5, 24]
     assert meta["inputs"]["delay_estimate"]["shape"] == [5, 8]
     assert meta["kept"]["return_memory"] == "return_memory_next"
     assert meta["kept"]["delay_estimate"] == "delay_estimate_next"
+    assert meta["inputs"]["joints"]["shape"] == [5, 43]
     assert meta["kept"]["attitude"] == "attitude_next"
+    assert meta["kept"]["joints"] == "joints_next"
 
 
 def test_the_filter_of_the_whole_flight_is_exported_for_any_number_of_robots(tmp_path: Path) -> None:
