@@ -12,15 +12,12 @@ from torch import Tensor
 from pace.rl.reward_kernels import JointArrays, Measures, RobotArrays, measure
 from pace.rl.task import Game
 from pace.rl.task_kernels import DerivedArrays, derive
+from pace.sim.robot import RIGHT_ARM
 from pace.sim.sharing import record, share, share_all
 
 if TYPE_CHECKING:
     from pace.sim.ball import BallSim
     from pace.sim.worlds import RobotState, Worlds
-
-
-def _is_right_arm(name: str) -> bool:
-    return name.startswith("Right_") and ("Shoulder" in name or "Elbow" in name)
 
 
 def _is_hip_waist_left_arm(name: str) -> bool:
@@ -33,7 +30,7 @@ JOINT_GROUPS: dict[str, Callable[[str], bool]] = {
     "ankles": lambda name: "Ankle" in name,
     "hip_waist_left_arm": _is_hip_waist_left_arm,
     "left_shoulder_roll": lambda name: name == "Left_Shoulder_Roll",
-    "right_arm": _is_right_arm,
+    "right_arm": RIGHT_ARM.__contains__,
 }
 
 

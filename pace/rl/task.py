@@ -18,6 +18,7 @@ from pace.rl.outcome import Outcome
 from pace.rl.task_kernels import GameArrays, Rules
 from pace.sim.ball_kernels import EventArrays, ForecastArrays
 from pace.sim.draws import Column, Draws, columns_of
+from pace.sim.robot import RIGHT_ARM
 from pace.sim.sharing import record, share, share_all
 from pace.sim.snapshot import restore, snapshot, under_prefix, with_prefix
 
@@ -89,7 +90,7 @@ def _joint_ranges(config: ResetConfig, names: tuple[str, ...], nominal: list[flo
     """Lowest and highest angle of each joint at the start of an episode, rad."""
     ranges = []
     for name, angle in zip(names, nominal, strict=True):
-        if name.startswith("Right") and ("Shoulder" in name or "Elbow" in name):
+        if name in RIGHT_ARM:
             low, high = (angle + end for end in config.right_arm_offset)
         else:
             low, high = (angle * end for end in config.joint_scale)

@@ -36,6 +36,8 @@ JOINT_NAMES = (
     "Right_Ankle_Pitch",
     "Right_Ankle_Roll",
 )
+#: Those between the trunk and the paddle, past the waist.
+RIGHT_ARM = tuple(name for name in JOINT_NAMES if name.startswith(("Right_Shoulder", "Right_Elbow")))
 #: What can touch floor, table or paddle besides the feet; each is the name of its collision geom.
 CONTACT_BODIES = (
     "trunk",

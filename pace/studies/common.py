@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pace.config import TrainConfig, load_train_config
-from pace.sim.robot import JOINT_NAMES, build_model
+from pace.sim.robot import JOINT_NAMES, RIGHT_ARM, build_model
 
 Array = NDArray[np.float64]
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")  # told apart by all kinds of vision
@@ -23,7 +23,7 @@ ENDLESS = (
     "engine=native", "engine.threads=1", "engine.physics_dt=0.002",
 )  # fmt: skip
 #: Columns of the joints that carry the paddle: waist and right arm.
-ARM = [i for i, name in enumerate(JOINT_NAMES) if name == "Waist" or name.startswith(("Right_Sh", "Right_El"))]
+ARM = [JOINT_NAMES.index(name) for name in (*RIGHT_ARM, "Waist")]
 
 
 @lru_cache
