@@ -115,6 +115,7 @@ def test_the_exported_step_is_the_kernels() -> None:
 def test_the_task_knows_its_joints_better() -> None:
     env = make_env(64, "native", "cpu", overrides=["observation=memory", "engine.threads=1"])
     assert env.actor.joints is not None
+    assert env.actor.attitude is not None
     joints, robot, sensing = env.actor.joints, env.worlds.robot, env.sensing
     for _ in range(30):
         env.advance(torch.zeros(64, 21))
