@@ -163,17 +163,17 @@ def heat_map(labels: Sequence[tuple[str, str]], tables: Sequence[Sequence[Mappin
     """Hits and successes in per cent, with half of their 95 % interval: a line for each label (kind of change, text), a
     column for each serve range. ``tables`` holds the summaries of the rows of each line."""
     names = [row["serve"].replace("_", "-") for row in tables[0]]
-    figure = new_figure(3.4 + 1.7 * len(names), 1.9 + 0.28 * len(labels))
+    figure = new_figure(4.6 + 1.7 * len(names), 1.9 + 0.28 * len(labels))
     panels = figure.subplots(1, 2, sharey=True, squeeze=False)[0]
     breaks = [y - 0.5 for y in range(1, len(labels)) if labels[y][0] != labels[y - 1][0]]
     images = [_heat_panel(axes, share, tables) for axes, share in zip(panels, ("hit", "success"), strict=True)]
     for axes in panels:
         axes.hlines(breaks, -0.5, len(names) - 0.5, color="white", linewidth=3)
-        axes.set(xlabel="range of the serves", xticks=range(len(names)), xticklabels=names)
+        axes.set(xlabel="serves", xticks=range(len(names)), xticklabels=names)
         axes.set_yticks(range(len(labels)), [text for _, text in labels])
         axes.tick_params(length=0)
     figure.colorbar(images[0], ax=panels, shrink=0.8, label="% of serves")
-    figure.suptitle(f"{title}\n± half of the 95 % interval", fontsize="medium")
+    figure.suptitle(f"{title}\n± half of the 95 % interval", fontsize="medium", wrap=True)
     return figure
 
 
@@ -183,10 +183,10 @@ def _heat_panel(axes: Axes, share: str, tables: Sequence[Sequence[Mapping[str, A
     image = axes.imshow(per_cent, vmin=0, vmax=100, cmap="RdYlGn", aspect="auto")
     for y, rows in enumerate(tables):
         for x, row in enumerate(rows):
-            text = f"{per_cent[y][x]:.0f} ±{50 * (row[f'{share}_high'] - row[f'{share}_low']):.0f}"
+            text = f"{per_cent[y][x]:.1f} ±{50 * (row[f'{share}_high'] - row[f'{share}_low']):.1f}"
             colour = "white" if abs(per_cent[y][x] - 50.0) > DARK else "black"
             axes.text(x, y, text, ha="center", va="center", fontsize="small", color=colour)
-    axes.set_title(f"{share}, % of serves")
+    axes.set_title(f"{share}, %")
     return image
 
 

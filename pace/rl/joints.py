@@ -20,7 +20,7 @@ class JointEstimate(Estimate):
     """A Kalman filter of each joint, which moves on at the velocity it has: steady gains, no model of the robot.
 
     With the paper's noise (+-0.01 rad and +-1.5 rad/s, 0.0058 and 0.87 in root mean square) joints of a robot that
-    plays are known to 0.0054 rad and 0.50 rad/s, with twice the noise to 0.010 and 0.70 (of 0.012 and 1.7).
+    plays are known to 0.0053 rad and 0.47 rad/s, with twice the noise to 0.010 and 0.77 (of 0.012 and 1.7).
 
     Attributes: ``state`` (N, 1 + 2 J): 1 once anything was seen, then ``position`` (N, J) rad relative to the nominal
     pose and ``velocity`` (N, J) rad/s. A new episode begins with what is sensed.
