@@ -146,7 +146,10 @@ def open_run(config: TrainConfig, first_update: int) -> RunFolder:
 def announce(trainer: Trainer, run: RunFolder) -> None:
     """Print what is about to be trained, on what, and where it is kept."""
     shared = f" in {trainer.team.size} processes" if trainer.team.size > 1 else ""
-    number_format = str(trainer.agent.observation_dtype).removeprefix("torch.")
+    agent = trainer.agent
+    number_format = str(agent.observation_dtype).removeprefix("torch.")
+    if agent.observation_dtype != torch.float32 and agent.fp32_below > 0.0:
+        number_format += f" (float32 below a std of {agent.fp32_below:g})"
     print(
         f"training {trainer.config.name}: {trainer.config.num_worlds} worlds on {trainer.device}{shared}, "
         f"networks in {number_format}, run folder {run.path}",
