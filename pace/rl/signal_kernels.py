@@ -339,14 +339,19 @@ def estimate_joints(
     row = estimate[world]
     if restart == 1 and not mask[world]:
         return
-    share = gain  # of what is sensed; all of it at first
-    if restart == 1 or row[0] != 1.0:
+    anew = restart == 1 or row[0] != 1.0
+    share = gain  # of what is sensed
+    if anew:
         share = wp.identity(2, dtype=wp.float32)
     row[0] = 1.0
     count = position.shape[1]
     for joint in range(count):
-        speed = wp.float32(row[FIRST_JOINT + count + joint])
-        said = row[FIRST_JOINT + joint] + control_dt * speed
+        at, turning = FIRST_JOINT + joint, FIRST_JOINT + count + joint
+        if anew:  # whatever was there before
+            row[at] = 0.0
+            row[turning] = 0.0
+        speed = wp.float32(row[turning])
+        said = row[at] + control_dt * speed
         learned = share * wp.vec2(position[world, joint] - said, velocity[world, joint] - speed)
-        row[FIRST_JOINT + joint] = said + learned[0]
-        row[FIRST_JOINT + count + joint] = speed + learned[1]
+        row[at] = said + learned[0]
+        row[turning] = speed + learned[1]

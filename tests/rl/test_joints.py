@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -92,11 +93,12 @@ def test_one_world_begins_anew_with_what_is_sensed() -> None:
         shaking.step()
         shaking.estimate.update()
     before = shaking.estimate.state.clone()
+    shaking.estimate.state[0] = math.nan  # is forgotten with all the rest
     shaking.step()
     shaking.estimate.restart(torch.tensor([True, False]))
     assert torch.equal(shaking.estimate.state[1], before[1])
-    torch.testing.assert_close(shaking.estimate.position[0], shaking.sensing.joint_position[0], atol=1e-6, rtol=0.0)
-    torch.testing.assert_close(shaking.estimate.velocity[0], shaking.sensing.joint_velocity[0], atol=1e-6, rtol=0.0)
+    assert torch.equal(shaking.estimate.position[0], shaking.sensing.joint_position[0])
+    assert torch.equal(shaking.estimate.velocity[0], shaking.sensing.joint_velocity[0])
 
 
 def test_the_exported_step_is_the_kernels() -> None:
