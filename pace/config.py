@@ -310,6 +310,15 @@ class JointEstimateConfig:
             _require(good, f"observation.joint_estimate.{name} must be positive and finite, got {value}")
 
 
+#: Numbers of the observation's configuration -> the actor's observations that need them.
+OBSERVED_FROM = {
+    "return_memory": ("last_return",),
+    "delay_estimate": ("sensed_delay",),
+    "attitude_estimate": ("estimated_gravity", "estimated_heading"),
+    "joint_estimate": ("estimated_joint_position", "estimated_joint_velocity"),
+}
+
+
 @dataclass
 class ObservationConfig:
     """Names of the observations of each network, in order, and how many control steps of history each sees."""
@@ -319,33 +328,35 @@ class ObservationConfig:
     critic: list[str]
     policy_history: int
     critic_history: int
-    return_memory: ReturnMemoryConfig | None = None  # needed by the observation last_return
-    delay_estimate: DelayEstimateConfig | None = None  # needed by the observation sensed_delay
-    # needed by the observations estimated_gravity and estimated_heading; with them it gives the paddle's pose too
+    # each needed by its observations of OBSERVED_FROM; the last two, observed, give the paddle's pose too
+    return_memory: ReturnMemoryConfig | None = None
+    delay_estimate: DelayEstimateConfig | None = None
     attitude_estimate: AttitudeEstimateConfig | None = None
-    # needed by the observations estimated_joint_position and estimated_joint_velocity; likewise
     joint_estimate: JointEstimateConfig | None = None
 
     @property
     def memory(self) -> ReturnMemoryConfig | None:
         """Numbers of the memory of returns, where the policy observes it."""
-        return self.return_memory if "last_return" in self.policy else None
+        return self.return_memory if self.observed_from("return_memory") else None
 
     @property
     def delay(self) -> DelayEstimateConfig | None:
         """Numbers of the estimate of the delay, where the policy observes it."""
-        return self.delay_estimate if "sensed_delay" in self.policy else None
+        return self.delay_estimate if self.observed_from("delay_estimate") else None
 
     @property
     def attitude(self) -> AttitudeEstimateConfig | None:
         """Numbers of the filter of the orientation, where the policy observes it."""
-        return self.attitude_estimate if {"estimated_gravity", "estimated_heading"} & set(self.policy) else None
+        return self.attitude_estimate if self.observed_from("attitude_estimate") else None
 
     @property
     def joints(self) -> JointEstimateConfig | None:
         """Numbers of the filter of the joints, where the policy observes it."""
-        observed = {"estimated_joint_position", "estimated_joint_velocity"} & set(self.policy)
-        return self.joint_estimate if observed else None
+        return self.joint_estimate if self.observed_from("joint_estimate") else None
+
+    def observed_from(self, numbers: str) -> list[str]:
+        """Which of the policy's observations need these numbers, a key of ``OBSERVED_FROM``."""
+        return [name for name in OBSERVED_FROM[numbers] if name in self.policy]
 
     def __post_init__(self) -> None:
         _require(self.policy_history >= 1, "observation.policy_history must be at least 1")

@@ -61,90 +61,58 @@ OUTPUTS = {
     "something_to_hit": Port(1, "0 or 1", "the ball can still be hit, as far as the robot can know"),
     "ball_moved_away_next": Port(1, "0 or 1", "kept by the caller for the next call"),
 }
-#: Inputs and outputs besides, of a policy that observes ``last_return``.
-MEMORY_INPUTS = {
-    "return_memory": Port(
-        MEMORY_SIZE, "m, m/s, 1", "the output return_memory_next of the calls before; zeros before the first one"
+#: What a policy that observes it keeps over an episode: which of ``ObservationConfig`` says so, and the port, an input
+#: of that name and an output ``<name>_next``; the meaning is that of the output.
+EPISODE = {
+    "return_memory": (
+        "memory",
+        Port(
+            MEMORY_SIZE,
+            "m, m/s, 1",
+            "; the last five: velocity of the last return, restitution of paddle and ball above the prior, share of "
+            "hits that it is known from",
+        ),
     ),
-}
-MEMORY_OUTPUTS = {
-    "return_memory_next": Port(
-        MEMORY_SIZE,
-        "m, m/s, 1",
-        "kept by the caller as return_memory of the next call; the last five: velocity of the last return, restitution "
-        "of paddle and ball above the prior, share of hits that it is known from",
+    "delay_estimate": (
+        "delay",
+        Port(DELAY_SIZE, "rad, rad/s, s", "; the last: delay of motion capture above the prior"),
     ),
-}
-#: Inputs and outputs besides, of a policy that observes ``sensed_delay``.
-DELAY_INPUTS = {
-    "delay_estimate": Port(
-        DELAY_SIZE, "rad, rad/s, s", "the output delay_estimate_next of the calls before; zeros before the first one"
+    "attitude": (
+        "attitude",
+        Port(ATTITUDE_SIZE, "1, rad/s", ": 1, estimated gravity and heading, angular velocity"),
     ),
-}
-DELAY_OUTPUTS = {
-    "delay_estimate_next": Port(
-        DELAY_SIZE,
-        "rad, rad/s, s",
-        "kept by the caller as delay_estimate of the next call; the last: delay of motion capture above the prior",
-    ),
-}
-#: Inputs and outputs besides, of a policy that observes ``estimated_gravity`` or ``estimated_heading``.
-ATTITUDE_INPUTS = {
-    "attitude": Port(
-        ATTITUDE_SIZE, "1, rad/s", "the output attitude_next of the calls before; zeros before the first one"
-    ),
-}
-ATTITUDE_OUTPUTS = {
-    "attitude_next": Port(
-        ATTITUDE_SIZE,
-        "1, rad/s",
-        "kept by the caller as attitude of the next call: 1, estimated gravity and heading, angular velocity",
-    ),
-}
-#: Inputs and outputs besides, of a policy that observes ``estimated_joint_position`` or ``estimated_joint_velocity``.
-JOINTS_INPUTS = {
-    "joints": Port(
-        1 + 2 * JOINTS, "1, rad, rad/s", "the output joints_next of the calls before; zeros before the first one"
-    ),
-}
-JOINTS_OUTPUTS = {
-    "joints_next": Port(
-        1 + 2 * JOINTS,
-        "1, rad, rad/s",
-        "kept by the caller as joints of the next call: 1, estimated positions above the nominal pose, velocities",
+    "joints": (
+        "joints",
+        Port(1 + 2 * JOINTS, "1, rad, rad/s", ": 1, estimated positions above the nominal pose, velocities"),
     ),
 }
 #: Input -> the output of the calls before that it is made of. An ONNX graph has one name space, hence the other names.
 KEPT = {
     "previous_action": "action",
     "ball_moved_away": "ball_moved_away_next",
-    "return_memory": "return_memory_next",
-    "delay_estimate": "delay_estimate_next",
-    "attitude": "attitude_next",
-    "joints": "joints_next",
+    **{name: f"{name}_next" for name in EPISODE},
 }
 
 
 def input_ports(config: TaskConfig) -> dict[str, Port]:
     """The policy's inputs, in order."""
-    return INPUTS | _of_those_kept(config, MEMORY_INPUTS, DELAY_INPUTS, ATTITUDE_INPUTS, JOINTS_INPUTS)
+    given = "the output {}_next of the calls before; zeros before the first one"
+    return INPUTS | {name: port._replace(meaning=given.format(name)) for name, port in _of_episode(config).items()}
 
 
 def output_ports(config: TaskConfig) -> dict[str, Port]:
     """The policy's outputs, in order."""
-    return OUTPUTS | _of_those_kept(config, MEMORY_OUTPUTS, DELAY_OUTPUTS, ATTITUDE_OUTPUTS, JOINTS_OUTPUTS)
-
-
-def _of_those_kept(config: TaskConfig, *ports: dict[str, Port]) -> dict[str, Port]:
-    """Those of the ``ports`` of memory, delay, attitude and joints that the policy observes."""
-    seen = config.observation
-    observed = (seen.memory, seen.delay, seen.attitude, seen.joints)
-    return {
-        name: port
-        for numbers, part in zip(observed, ports, strict=True)
-        if numbers is not None
-        for name, port in part.items()
+    kept = _of_episode(config).items()
+    return OUTPUTS | {
+        f"{name}_next": port._replace(meaning=f"kept by the caller as {name} of the next call{port.meaning}")
+        for name, port in kept
     }
+
+
+def _of_episode(config: TaskConfig) -> dict[str, Port]:
+    """Those of ``EPISODE`` that the policy observes."""
+    observation = config.observation
+    return {name: port for name, (numbers, port) in EPISODE.items() if getattr(observation, numbers) is not None}
 
 
 def kept_outputs(config: TaskConfig) -> dict[str, str]:
@@ -348,7 +316,7 @@ class DeployedPolicy(nn.Module):
         self.attitude = AttitudeEstimateStep(numbers, config.robot.control_dt) if numbers else None
         numbers = config.observation.joints
         self.joints = JointEstimateStep(numbers, config.robot.control_dt) if numbers else None
-        self.kept = [name for name in input_ports(config) if name not in INPUTS]
+        self.kept = list(_of_episode(config))
         self.names = list(config.observation.policy)
         self.action_scale, self.action_clip = config.robot.action_scale, config.robot.action_clip
         self.register_buffer("nominal", torch.tensor(nominal_pose(config.robot), dtype=torch.float32))

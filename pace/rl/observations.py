@@ -17,7 +17,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from pace.config import ConfigError, ObservationConfig, PredictorConfig, ReturnMemoryConfig
+from pace.config import OBSERVED_FROM, ConfigError, ObservationConfig, PredictorConfig, ReturnMemoryConfig
 from pace.predictor.network import OUTPUT_SIZES, predictor_slices
 from pace.rl.attitude import AttitudeEstimate
 from pace.rl.delay import DelayEstimate
@@ -290,13 +290,6 @@ CRITIC: dict[str, CriticObservation] = {
     "mocap_delay": CriticObservation(1, lambda s: _column(s.mocap_delay)),
 }
 
-#: Numbers of the configuration that observations of the actor need.
-ESTIMATES = {
-    "attitude_estimate": ("estimated_gravity", "estimated_heading"),
-    "joint_estimate": ("estimated_joint_position", "estimated_joint_velocity"),
-    "delay_estimate": ("sensed_delay",),
-}
-
 Table = Mapping[str, ActorObservation] | Mapping[str, CriticObservation]
 
 
@@ -304,17 +297,12 @@ def check_policy(observation: ObservationConfig, predictor: PredictorConfig) -> 
     """Raise :class:`ConfigError` for a name that the actor may not see, or that nobody computes."""
     names = observation.policy
     _check_names("policy", names, POLICY)
-    if "last_return" in names:
-        if observation.return_memory is None:
-            raise ConfigError(
-                "observation.policy has 'last_return': give observation.return_memory (observation=memory)"
-            )
-        if predictor.frames < 5:
-            raise ConfigError(f"observation 'last_return' needs predictor.frames of 5 or more, got {predictor.frames}")
-    for needed, observed in ESTIMATES.items():
-        asked = [name for name in observed if name in names]
+    for needed in OBSERVED_FROM:
+        asked = observation.observed_from(needed)
         if asked and getattr(observation, needed) is None:
             raise ConfigError(f"observation.policy has '{asked[0]}': give observation.{needed} (observation=memory)")
+    if "last_return" in names and predictor.frames < 5:
+        raise ConfigError(f"observation 'last_return' needs predictor.frames of 5 or more, got {predictor.frames}")
     if "predicted_time" in names and predictor.enabled and "target_time" not in predictor.outputs:
         raise ConfigError("observation.policy has 'predicted_time': add 'target_time' to predictor.outputs")
 

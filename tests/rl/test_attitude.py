@@ -17,6 +17,7 @@ from pace.rl.attitude import AttitudeEstimate
 from pace.rl.deployed_memory import AttitudeEstimateStep
 from pace.rl.env import make_env
 from pace.rl.observations import check_policy
+from tests.rl.estimates import check_observed_kept_and_begun
 from tests.rl.fakes import config
 
 DT, GAIN = 0.02, 0.1
@@ -135,19 +136,7 @@ def test_the_task_knows_its_orientation_and_paddle_better() -> None:
 
 
 def test_it_is_observed_kept_and_begins_with_the_episode() -> None:
-    env = make_env(2, "native", "cpu", overrides=["observation=memory", "engine.threads=1"])
-    assert env.actor.attitude is not None
-    for _ in range(5):
-        env.advance(torch.zeros(2, 21))
-    frame = env.policy_observation.view(2, 5, -1)[:, -1]
-    assert torch.equal(frame[:, env.policy_layout["estimated_gravity"]], env.actor.attitude.gravity)
-    assert torch.equal(frame[:, env.policy_layout["estimated_heading"]], env.actor.attitude.heading)
-    saved, kept = env.state_dict(), env.actor.attitude.state.clone()
-    env.reset_worlds(torch.tensor([True, False]))
-    assert torch.equal(env.actor.attitude.state[1], kept[1])
-    assert not torch.equal(env.actor.attitude.state[0], kept[0])
-    env.load_state_dict(saved)
-    assert torch.equal(env.actor.attitude.state, kept)
+    check_observed_kept_and_begun("attitude", {"estimated_gravity": "gravity", "estimated_heading": "heading"})
 
 
 def test_wrong_numbers_are_refused() -> None:

@@ -16,6 +16,7 @@ from pace.rl.deployed_memory import JointEstimateStep
 from pace.rl.env import make_env
 from pace.rl.joints import JointEstimate, steady_gain
 from pace.rl.observations import check_policy
+from tests.rl.estimates import check_observed_kept_and_begun
 from tests.rl.fakes import config
 
 DT = 0.02
@@ -135,19 +136,9 @@ def test_the_task_knows_its_joints_better() -> None:
 
 
 def test_they_are_observed_kept_and_begin_with_the_episode() -> None:
-    env = make_env(2, "native", "cpu", overrides=["observation=memory", "engine.threads=1"])
-    assert env.actor.joints is not None
-    for _ in range(5):
-        env.advance(torch.zeros(2, 21))
-    frame = env.policy_observation.view(2, 5, -1)[:, -1]
-    assert torch.equal(frame[:, env.policy_layout["estimated_joint_position"]], env.actor.joints.position)
-    assert torch.equal(frame[:, env.policy_layout["estimated_joint_velocity"]], env.actor.joints.velocity)
-    saved, kept = env.state_dict(), env.actor.joints.state.clone()
-    env.reset_worlds(torch.tensor([True, False]))
-    assert torch.equal(env.actor.joints.state[1], kept[1])
-    assert not torch.equal(env.actor.joints.state[0], kept[0])
-    env.load_state_dict(saved)
-    assert torch.equal(env.actor.joints.state, kept)
+    check_observed_kept_and_begun(
+        "joints", {"estimated_joint_position": "position", "estimated_joint_velocity": "velocity"}
+    )
 
 
 def test_wrong_numbers_are_refused() -> None:
