@@ -30,7 +30,7 @@ TRAIN = (sys.executable, "-m", "pace.rl.train")
 POLL_SECONDS = 0.5
 TAIL_BYTES = 8192  # of a metrics.csv: more than its last row
 #: What may differ between the runs that are there and those that are asked for.
-FREE_KEYS = (*RESUME_KEYS, "init_from", "predictor_from", "run_dir", "processes")
+FREE_KEYS = (*RESUME_KEYS, "init_from", "predictor_from", "run_dir")
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,8 @@ if TYPE_CHECKING:
     from pace.rl.env import TableTennisEnv
 
 # What a resumed run may change; everything else is as it was saved, or the run would not go on where it stopped.
-RESUME_KEYS = ("resume", "samples", "minutes", "checkpoint_minutes", "tensorboard", "progress", "device")
+# Other processes play other worlds, which begin anew.
+RESUME_KEYS = ("resume", "samples", "minutes", "checkpoint_minutes", "tensorboard", "progress", "device", "processes")
 SEEDS_APART = 1_000_003  # between the stages of a curriculum: further than seeds of runs lie apart
 
 
@@ -54,7 +55,6 @@ def train_from_config(composed: DictConfig) -> None:
         overrides = list(HydraConfig.get().overrides.task)
         saved = load_checkpoint(config.resume)
         config = resumed_config(saved, config.resume, overrides)
-        print(f"going on from {saved.path}")
     else:
         saved = None
     device = own_device(resolve_device(config.device))
@@ -62,7 +62,7 @@ def train_from_config(composed: DictConfig) -> None:
     with team_of(config.processes, device) as team:
         trainer = build_trainer(config, saved, device, team)
         if trainer.run is not None:
-            announce(trainer, trainer.run)
+            announce(trainer, trainer.run, saved)
         summary = trainer.train()
     if summary is not None:
         report(summary)
@@ -143,8 +143,12 @@ def open_run(config: TrainConfig, first_update: int) -> RunFolder:
     return RunFolder(Path(config.run_dir), to_dict(config), config.tensorboard, first_update)
 
 
-def announce(trainer: Trainer, run: RunFolder) -> None:
-    """Print what is about to be trained, on what, and where it is kept."""
+def announce(trainer: Trainer, run: RunFolder, saved: Checkpoint | None) -> None:
+    """Print what is about to be trained, on what, from what, and where it is kept."""
+    if saved is not None:
+        before = len(saved.training["processes"]) if saved.training else 0
+        anew = f" of {before} processes, with worlds that begin anew" if before != trainer.team.size else ""
+        print(f"going on from {saved.path}{anew}")
     shared = f" in {trainer.team.size} processes" if trainer.team.size > 1 else ""
     agent = trainer.agent
     number_format = str(agent.observation_dtype).removeprefix("torch.")

@@ -295,29 +295,33 @@ class Trainer:
     def resume(self, checkpoint: Checkpoint) -> None:
         """Go on exactly where ``checkpoint`` was written.
 
+        Another number of processes than wrote it has the same networks, optimisers and counters, and worlds that begin
+        anew.
+
         Errors: :class:`CheckpointError` when it holds weights only or does not fit this configuration.
         """
         state = checkpoint.training
         if state is None:
             raise CheckpointError(f"{checkpoint.path} holds weights only: use init_from instead of resume")
         self.load_weights(checkpoint)
-        if len(state.get("processes", ())) != self.team.size:
-            raise CheckpointError(
-                f"{checkpoint.path} was written by {len(state.get('processes', ()))} processes, "
-                f"and {self.team.size} cannot go on from it: start as many, or use init_from instead of resume"
-            )
         try:
             self.ppo.load_state_dict(state["ppo"])
             self.regression.load_state_dict(state["regression"])
-            own = state["processes"][self.team.rank]
-            self.env.load_state_dict(own["env"])
-            torch.set_rng_state(own["random"])
-            if self.device.type == "cuda" and "random_cuda" in own:
-                torch.cuda.set_rng_state(own["random_cuda"], self.device)
+            if len(state["processes"]) == self.team.size:
+                self._resume_play(state["processes"][self.team.rank])
+            else:  # none of what was drawn at the start of the run is drawn again
+                torch.manual_seed(self.team.seed(self.config.seed + int(checkpoint.counters["updates"])))
         except (KeyError, ValueError, RuntimeError) as error:
             raise CheckpointError(f"{checkpoint.path} does not fit this configuration: {error}") from error
         self.updates, self.samples = int(checkpoint.counters["updates"]), int(checkpoint.counters["samples"])
         self.wall_s = float(checkpoint.counters["wall_s"])
+
+    def _resume_play(self, own: dict[str, Any]) -> None:
+        """This process's worlds and random numbers, as :meth:`checkpoint` keeps them."""
+        self.env.load_state_dict(own["env"])
+        torch.set_rng_state(own["random"])
+        if self.device.type == "cuda" and "random_cuda" in own:
+            torch.cuda.set_rng_state(own["random_cuda"], self.device)
 
 
 def summarise(statistics: dict[str, Tensor], control_dt: float, team: Team | None = None) -> dict[str, float]:

@@ -22,7 +22,7 @@ from torch import Tensor
 from pace.config import ConfigError, load_train_config
 from pace.predictor.network import PredictorNetwork
 from pace.predictor.regression import PredictorTrainer
-from pace.rl.checkpoint import CheckpointError, load_checkpoint
+from pace.rl.checkpoint import flatten_tensors, load_checkpoint
 from pace.rl.milestones import read_metrics
 from pace.rl.policy import Agent, RunningNorm
 from pace.rl.ppo import PPO
@@ -211,15 +211,26 @@ def test_seeds_differ_between_processes_and_the_leaders_is_its_own() -> None:
     assert seeds[4] == 2
 
 
-def test_another_number_of_processes_cannot_resume(tmp_path: Path) -> None:
-    config = load_train_config(["num_worlds=8", "tensorboard=false", "progress=false"])
-    predictor = PredictorNetwork(config.predictor)
-    trainer = Trainer(config, DummyTask(8), predictor, None)
-    saved = trainer.checkpoint()
+def test_another_number_of_processes_resumes_what_was_learned() -> None:
+    config = load_train_config(["num_worlds=8", "tensorboard=false", "progress=false", "algo.std_floor=0.0"])
+    first, second = (Trainer(config, DummyTask(8), PredictorNetwork(config.predictor), None) for _ in range(2))
+    first.update()
+    saved = first.checkpoint()
     assert saved.training is not None
-    saved.training["processes"] *= 2
-    with pytest.raises(CheckpointError, match="written by 2 processes, and 1 cannot go on"):
-        trainer.resume(saved)
+    saved.training["processes"] = [{"env": "of worlds that are not these"}] * 2
+    second.resume(saved)
+    assert (second.updates, second.samples) == (1, first.samples)
+    again = second.checkpoint()
+    for part, tensors in saved.weights.items():
+        assert all(torch.equal(tensor, again.weights[part][name]) for name, tensor in tensors.items())
+    assert again.training is not None
+    before: dict[str, Tensor] = {}
+    after: dict[str, Tensor] = {}
+    for state, found in ((saved.training, before), (again.training, after)):
+        flatten_tensors({part: state[part] for part in ("ppo", "regression")}, "", found)
+    assert before.keys() == after.keys()
+    assert all(torch.equal(before[name], after[name]) for name in before)
+    second.update()
 
 
 # --- the command --------------------------------------------------------------------------------------------------
@@ -253,7 +264,7 @@ def children_of(pid: int) -> list[int]:
     return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
-def test_two_processes_train_and_resume_exactly(tmp_path: Path) -> None:
+def test_two_processes_train_and_resume_exactly_and_one_goes_on_from_them(tmp_path: Path) -> None:
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     status, out, err = finish(start(f"run_dir={whole}", f"samples={3 * UPDATE}", *SMALL))
     assert status == 0, err
@@ -271,6 +282,13 @@ def test_two_processes_train_and_resume_exactly(tmp_path: Path) -> None:
     assert read_metrics(whole / "metrics.csv")["mean_reward"] == read_metrics(parts / "metrics.csv")["mean_reward"]
     first, second = (worlds["env"]["worlds.position"] for worlds in expected.training["processes"])  # type: ignore[index]
     assert not torch.equal(first, second)  # each process plays worlds of its own
+    status, out, err = finish(start(f"resume={parts}", f"samples={4 * UPDATE}", "progress=false", "processes=1"))
+    assert status == 0, err
+    assert "update_00000003 of 2 processes, with worlds that begin anew" in out
+    alone = load_checkpoint(parts)
+    assert alone.counters["samples"] == 4 * UPDATE
+    assert alone.weights["agent"]["policy_norm.count"].item() == 4 * UPDATE
+    assert len(alone.training["processes"]) == 1  # type: ignore[index]
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="looks for child processes in /proc")
