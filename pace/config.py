@@ -427,6 +427,7 @@ class AlgoConfig:
     autocast: str  # auto (bf16 where the hardware has it, down to fp32_below), bf16, fp32
     later_steps: list[SchedulePoint] = field(default_factory=list)  # in place of steps from that many control steps on
     fp32_below: float = 0.0  # mean std of the policy below which autocast=auto computes in float32
+    observation_norm: bool = True  # by their running mean and spread; off: observations in their own units, clipped
 
     def steps_at(self, samples: float) -> int:
         """Control steps a world plays per update, ``samples`` control steps into the run."""

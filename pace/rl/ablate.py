@@ -31,6 +31,9 @@ from pace.rl.run_queue import Run, RunQueue, check_settings
 
 FIGURE = "ablation.png"
 DPI = 110
+COLOURS, DASHES = 10, ("-", "--", ":")  # of the figure: the next dash when the colours are used up
+#: Rate of a curve -> factor, unit and decimal places that it is shown with.
+SHOWN_RATES = {"hits": (100.0, "%", 1), "returns": (100.0, "%", 1), "falls": (1.0, "/s", 3)}
 #: Given to each run, or to none.
 OWN_KEYS = ("name", "seed", "samples", "minutes", "run_dir", "resume", "init_from", "predictor_from", "progress")
 TRAINING_KEYS = tuple(key for key in TrainConfig.__dataclass_fields__ if key not in OWN_KEYS)
@@ -57,8 +60,7 @@ def ablate_from_config(composed: DictConfig) -> None:
     if config.train:
         failures = train(config, out)
     curves = read_curves(config, out)
-    table = markdown(["M control steps to", *curves], milestone_rows(curves))
-    print(f"\n{table}\n\nwrote {draw(curves, out / FIGURE)}")
+    print(f"\n{summary(curves)}\n\nwrote {draw(curves, out / FIGURE)}")
     if failures:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in failures.items())
         raise AblationError(f"{len(failures)} runs failed, the same command tries them again: {reasons}")
@@ -113,9 +115,29 @@ def read_curves(config: AblateConfig, out: Path) -> Curves:
     return curves
 
 
-def milestone_rows(curves: Curves) -> list[list[str]]:
-    """Rows of the table: a milestone, and what each experiment needs for it."""
-    return [[milestone.label, *(needed(seeds, milestone) for seeds in curves.values())] for milestone in MILESTONES]
+def summary(curves: Curves) -> str:
+    """A row for each experiment: what it needs for each milestone that one of them reaches, and its rates at the last
+    control step that all runs have got to."""
+    runs = [curve for seeds in curves.values() for curve in seeds]
+    reached = [milestone for milestone in MILESTONES if any(passage(curve, milestone) for curve in runs)]
+    end = min((curve.samples[-1] for curve in runs if len(curve.samples)), default=0.0)
+    head = ["M control steps to", *(milestone.label for milestone in reached)]
+    head += [f"{rate}, {unit}, at {end / 1e6:.1f} M" for rate, (_, unit, _) in SHOWN_RATES.items()]
+    rows = []
+    for name, seeds in curves.items():
+        there = [at_end(seeds, rate, end) for rate in SHOWN_RATES]
+        rows.append([f"`{name}`", *(needed(seeds, milestone) for milestone in reached), *there])
+    return markdown(head, rows)
+
+
+def at_end(seeds: Sequence[Curve], rate: str, end: float) -> str:
+    """Mean and range over ``seeds`` of a rate at ``end`` control steps."""
+    factor, _, places = SHOWN_RATES[rate]
+    values = [factor * np.interp(end, curve.samples, curve.rates[rate]) for curve in seeds if len(curve.samples)]
+    if not values:
+        return "-"
+    text = f"{np.mean(values):.{places}f}"
+    return f"{text} ({min(values):.{places}f} to {max(values):.{places}f})" if len(seeds) > 1 else text
 
 
 def needed(seeds: Sequence[Curve], milestone: Milestone) -> str:
@@ -139,21 +161,24 @@ def draw(curves: Curves, file: Path) -> Path:
     figure = Figure(figsize=(11, 4.2), layout="constrained")
     for axes, rate in zip(figure.subplots(1, 2), ("hits", "returns"), strict=True):
         for number, (name, seeds) in enumerate(curves.items()):
-            _draw_experiment(axes, f"C{number}", name.replace("_", " "), seeds, rate)
+            style = {"color": f"C{number % COLOURS}", "ls": DASHES[number // COLOURS % len(DASHES)]}
+            _draw_experiment(axes, style, name.replace("_", " "), seeds, rate)
         axes.set(xlabel="control steps, millions", ylabel=f"{rate}, % of serves")
         axes.set_ylim(bottom=0)
         axes.grid(alpha=0.3)
-    figure.axes[0].legend(loc="upper left")
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside right upper", fontsize=8)
     figure.savefig(file, dpi=DPI)
     return file
 
 
-def _draw_experiment(axes: Axes, color: str, name: str, seeds: Sequence[Curve], rate: str) -> None:
+def _draw_experiment(axes: Axes, style: dict[str, str], name: str, seeds: Sequence[Curve], rate: str) -> None:
     samples, values = over_seeds(seeds, rate)
     label = f"{name} ({len(seeds)} seed{'s' if len(seeds) > 1 else ''})"
-    axes.plot(samples / 1e6, 100 * np.median(values, 0), color=color, label=label)
+    axes.plot(samples / 1e6, 100 * np.median(values, 0), **style, label=label)
     if len(seeds) > 1:
-        axes.fill_between(samples / 1e6, 100 * values.min(0), 100 * values.max(0), color=color, alpha=0.15, lw=0)
+        axes.fill_between(
+            samples / 1e6, 100 * values.min(0), 100 * values.max(0), color=style["color"], alpha=0.15, lw=0
+        )
 
 
 def over_seeds(seeds: Sequence[Curve], rate: str) -> tuple[Array, Array]:

@@ -50,7 +50,8 @@ class RunningNorm(nn.Module):
     """Running mean and variance of an observation, and the clipped standard score by them.
 
     The moments of batches are merged in float64 (Chan et al. 1979), so that a long run neither drifts nor saturates.
-    A batch with a NaN or an infinity is left out of them and clears ``finite``, the run's cheap check.
+    A batch with a NaN or an infinity is left out of them and clears ``finite``, the run's cheap check. Without
+    ``learns`` the moments stay 0 and 1: an observation is clipped in its own units.
     """
 
     count: Tensor
@@ -60,10 +61,11 @@ class RunningNorm(nn.Module):
     _scale: Tensor
     _shift: Tensor
 
-    def __init__(self, size: int, clip: float) -> None:
+    def __init__(self, size: int, clip: float, learns: bool = True) -> None:
         super().__init__()
         self.size = size
         self.clip = clip
+        self.learns = learns
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
         self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
         self.register_buffer("var", torch.ones(size, dtype=torch.float64))
@@ -75,6 +77,9 @@ class RunningNorm(nn.Module):
     @torch.no_grad()
     def update(self, observation: Tensor) -> None:
         """Merge a batch (N, size), float32, into the moments."""
+        if not self.learns:
+            self.finite.logical_and_(torch.isfinite(observation).all())
+            return
         batch = observation.shape[0]
         batch_mean = observation.mean(0)
         batch_var = (observation - batch_mean).square_().mean(0).double()
@@ -99,7 +104,7 @@ class RunningNorm(nn.Module):
 
         In powers about the old mean, what a process saw is a plain difference of sums, and those add up.
         """
-        if team.size == 1:
+        if team.size == 1 or not self.learns:
             return
         count, mean, var = before
         shift = self.mean - mean
@@ -194,8 +199,8 @@ class Agent(nn.Module):
         self.fast_dtype = self.observation_dtype = compute_dtype(config.autocast, device)
         self.fp32_below = config.fp32_below if config.autocast == "auto" else 0.0
         self.num_actions = actions
-        self.policy_norm = RunningNorm(policy_size, config.observation_clip)
-        self.critic_norm = RunningNorm(critic_size, config.observation_clip)
+        self.policy_norm = RunningNorm(policy_size, config.observation_clip, config.observation_norm)
+        self.critic_norm = RunningNorm(critic_size, config.observation_clip, config.observation_norm)
         self.actor = GaussianActor(policy_size, actions, config, self.observation_dtype)
         self.critic = MLP(critic_size, config.critic_hidden, 1, 1.0, self.observation_dtype)
         self.to(device)
@@ -238,7 +243,7 @@ class Policy(nn.Module):
     @classmethod
     def build(cls, policy_size: int, actions: int, config: AlgoConfig) -> Policy:
         """An untrained policy of the right shape, to load weights into."""
-        norm = RunningNorm(policy_size, config.observation_clip)
+        norm = RunningNorm(policy_size, config.observation_clip, config.observation_norm)
         return cls(norm, MLP(policy_size, config.actor_hidden, actions, config.last_layer_gain, torch.float32))
 
     def forward(self, observation: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pace.config import AblateConfig, ConfigError, TrainConfig, compose, load_train_config, parse, to_dict
-from pace.rl.ablate import FIGURE, main, needed, over_seeds, planned_runs
+from pace.rl.ablate import FIGURE, main, needed, over_seeds, planned_runs, summary
 from pace.rl.milestones import Curve, Milestone, read_metrics
 
 TINY = (
@@ -92,6 +92,18 @@ def test_median_and_range_over_seeds() -> None:
     assert needed(seeds[:1], half) == "5.0"
 
 
+def test_the_table_has_what_was_reached_and_rates_where_all_runs_have_been() -> None:
+    table = summary({"quick": [line(10.0, 0.1), line(10.0, 0.06)], "slow": [line(5.0, 0.02)]})
+    head, _, quick, slow = table.splitlines()
+    wanted = ("hits 10 %", "hits 50 %", "hits 90 %", "hits, %, at 5.0 M")
+    columns = head.split(" | ")
+    assert [name in columns for name in wanted] == [True] * 4
+    assert "returns 10 %" not in columns
+    assert quick.split(" | ")[columns.index("hits 50 %")] == "6.7 (5.0 to 8.4)"
+    assert quick.split(" | ")[columns.index("hits, %, at 5.0 M")] == "40.0 (30.0 to 50.0)"
+    assert slow.split(" | ")[columns.index("hits, %, at 5.0 M")] == "10.0"
+
+
 def test_seeds_are_compared_where_all_of_them_have_been() -> None:
     samples, values = over_seeds([line(4.0, 0.1), line(2.0, 0.2)], "hits")
     assert samples[-1] == pytest.approx(2e6)
@@ -116,7 +128,8 @@ def test_a_real_ablation_and_its_second_call(ablate, tmp_path: Path, capsys: pyt
     )  # fmt: skip
     assert ablate(f"samples={2 * UPDATE}", "jobs=2", *common) == 0
     printed = capsys.readouterr().out
-    assert "| M control steps to | no_predictor | paper_reward |" in printed
+    assert "| M control steps to | " in printed
+    assert "| `no_predictor` | " in printed
     assert f"wrote {out / FIGURE}" in printed
     for name in ("no_predictor", "paper_reward"):
         assert read_metrics(out / f"{name}_seed3.csv")["samples"] == [2 * UPDATE]

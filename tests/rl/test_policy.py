@@ -9,6 +9,7 @@ import torch
 
 from pace.config import AlgoConfig, ConfigError, SchedulePoint, load_train_config
 from pace.rl.policy import Agent, Policy, RunningNorm, compute_dtype, scheduled
+from pace.team import Team
 
 CPU = torch.device("cpu")
 
@@ -53,6 +54,16 @@ def test_running_norm_remembers_a_value_that_is_not_finite(bad: float) -> None:
     assert not norm.finite
     assert torch.isfinite(norm.mean).all()
     assert norm.count.item() == 16
+
+
+def test_a_norm_that_does_not_learn_clips_in_the_observations_own_units() -> None:
+    norm = RunningNorm(2, clip=5.0, learns=False)
+    norm.update(torch.full((8, 2), 3.0))
+    norm.pool(norm.moments(), Team(0, 2))  # nothing to add up, and nobody is asked
+    torch.testing.assert_close(norm(torch.tensor([[0.5, -70.0]])), torch.tensor([[0.5, -5.0]]))
+    assert norm.finite
+    norm.update(torch.tensor([[math.nan, 0.0]]))
+    assert not norm.finite
 
 
 def test_running_norm_goes_on_the_same_after_loading() -> None:
