@@ -580,7 +580,7 @@ class BenchConfig(TrainConfig):
 
 @dataclass
 class PaperRow:
-    """A row of the paper's table I."""
+    """A row of the paper's table II."""
 
     serves: int
     hit: float  # share of the serves

@@ -1,4 +1,4 @@
-"""Counting what a policy does with many serves: the rows of the paper's table I.
+"""Counting what a policy does with many serves: the rows of the paper's table II.
 
 Each of N worlds plays on without end and contributes the same number of serves, whatever becomes of them: a stop at a
 total would favour serves that end early, which are the lost ones. The first two serves of a world are not counted (the

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.legend import Legend
 
 STRIKES, LANDINGS, FOOTWORK = "strike_map.png", "landing_map.png", "footwork.png"
-#: Serve ranges by speed, m/s, as in the paper's table I: label, fastest and slowest vx, colour.
+#: Serve ranges by speed, m/s, as in the paper's table II: label, fastest and slowest vx, colour.
 SPEED_CLASSES = (
     ("long, 6.2 to 6.5 m/s", -6.5, -6.2, "tab:red"),
     ("mid-long, 5.7 to 6.2 m/s", -6.2, -5.7, "tab:orange"),

@@ -85,11 +85,16 @@ def markdown_table(header: Sequence[str], body: Sequence[Sequence[str]]) -> str:
     return "\n".join(f"| {' | '.join(cells)} |" for cells in (header, rule, *body))
 
 
+def bin_label(name: str) -> str:
+    """A bin of the predictor's error in words: ``0.1_0.2s`` is "0.1 to 0.2s"."""
+    return "after the apex" if name == "after_apex" else name.replace("_", " to ").replace("over to", "over")
+
+
 def tables(rows: Sequence[Row], paper: Mapping[str, PaperRow], markdown: bool = False) -> str:
     """The whole evaluation: rates beside the paper's, then failures, then the predictor."""
     table = markdown_table if markdown else text_table
     summaries = [row.summary for row in rows]
-    bins = [name.replace("_", " to ").replace("over to", "over") for name in summaries[0]["predictor_rmse_cm_by_time"]]
+    bins = [bin_label(name) for name in summaries[0]["predictor_rmse_cm_by_time"]]
     parts = [
         table(HEADER, [cells(row, paper) for row in summaries]),
         "What became of the other serves, % of all:",
