@@ -193,6 +193,8 @@ class RewardConfig:
 
     def __post_init__(self) -> None:
         _require(self.target_mode in ("intercept", "clamp"), "reward.target_mode must be intercept or clamp")
+        for name in ("arm_offset", "idle_base_xy"):
+            _require(len(getattr(self, name)) == 2, f"reward.{name} needs two numbers, got {getattr(self, name)}")
         given, needed = sorted(self.nothing_to_hit), ["falling_x", "low_z", "past_x"]
         _require(given == needed, f"reward.nothing_to_hit needs exactly {', '.join(needed)}; got {', '.join(given)}")
 
@@ -359,6 +361,8 @@ class ObservationConfig:
         return [name for name in OBSERVED_FROM[numbers] if name in self.policy]
 
     def __post_init__(self) -> None:
+        for name in ("policy", "critic"):
+            _require(len(getattr(self, name)) > 0, f"observation.{name} must name at least one")
         _require(self.policy_history >= 1, "observation.policy_history must be at least 1")
         _require(self.critic_history >= 1, "observation.critic_history must be at least 1")
 
@@ -440,12 +444,24 @@ class AlgoConfig:
             _require(whole, f"algo.later_steps: {point.value} is no number of steps")
         _require(self.autocast in ("auto", "bf16", "fp32"), "algo.autocast must be auto, bf16 or fp32")
         _require(self.fp32_below >= 0, "algo.fp32_below is a standard deviation: it cannot be negative")
-        _require(0 < self.gamma <= 1, "algo.gamma must lie in (0, 1]")
+        for name in ("gamma", "gae_lambda"):
+            _require(0 < getattr(self, name) <= 1, f"algo.{name} must lie in (0, 1]")
+        lowest, first, highest = self.learning_rate_min, self.learning_rate, self.learning_rate_max
+        in_order = 0 < lowest <= first <= highest
+        _require(in_order, "algo needs 0 < learning_rate_min <= learning_rate <= learning_rate_max")
+        for name in ("clip", "max_grad_norm", "observation_clip"):
+            _require(getattr(self, name) > 0, f"algo.{name} must be positive")
+        for name in ("actor_hidden", "critic_hidden"):
+            _require(min(getattr(self, name), default=1) >= 1, f"algo.{name}: a layer has at least 1 unit")
         for name in ("steps", "epochs", "minibatches"):
             _require(getattr(self, name) >= 1, f"algo.{name} must be at least 1")
         for name in ("entropy", "std", "kl_target"):
             _require(len(getattr(self, name)) >= 1, f"algo.{name} needs at least one point")
-        _require(all(point.value > 0 for point in self.kl_target), "algo.kl_target must be positive")
+        for name in ("std", "kl_target"):
+            _require(all(point.value > 0 for point in getattr(self, name)), f"algo.{name} must be positive")
+
+
+FLIGHT_DT = 0.02  # s, between the positions that ``predictor.features=flight`` fits
 
 
 @dataclass
@@ -466,6 +482,10 @@ class PredictorConfig:
     def __post_init__(self) -> None:
         known = ("steps", "flight")
         _require(self.features in known, f"predictor.features must be steps or flight, not {self.features!r}")
+        _require(self.learning_rate > 0, "predictor.learning_rate must be positive")
+        for name in ("batch_size", "batches_per_update"):
+            _require(getattr(self, name) >= 1, f"predictor.{name} must be at least 1, got {getattr(self, name)}")
+        _require(min(self.hidden, default=1) >= 1, "predictor.hidden: a layer has at least 1 unit")
 
 
 @dataclass
@@ -537,6 +557,8 @@ class TrainConfig(TaskConfig):
             self.processes == 0 or self.num_worlds % self.processes == 0,
             f"num_worlds {self.num_worlds} cannot be shared equally by {self.processes} processes",
         )
+        fits = self.predictor.features != "flight" or math.isclose(self.robot.control_dt, FLIGHT_DT)
+        _require(fits, f"predictor.features=flight needs robot.control_dt {FLIGHT_DT} s, got {self.robot.control_dt}")
         _require(self.samples > 0, "samples must be positive")
         _require(self.minutes >= 0, f"minutes must not be negative (0: no limit), got {self.minutes}")
         _require(not (self.resume and self.init_from), "give resume or init_from, not both")

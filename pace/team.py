@@ -14,6 +14,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from threading import Thread
 from typing import IO, Any, TypeVar
 
 import numpy as np
@@ -27,6 +28,7 @@ WORLDS_PER_PROCESS = 256  # with fewer, the fixed cost of each operation outweig
 LOCAL_ADDRESS = "127.0.0.1"
 MEMBERSHIP = "PACE_TEAM"  # environment variable of a helper process: its rank, the team's size, the leader's port
 SECONDS_TO_END = 10.0  # for a helper whose leader is done
+LEADER_IS_GONE = 3  # exit status of a helper
 SECONDS_TO_FAIL = 3.0  # between a lost connection and the end of the process behind it
 POLL_SECONDS = 0.05
 TAIL_LINES = 15  # of what a failed helper printed
@@ -124,14 +126,19 @@ def threads_of(size: int) -> int:
 
 
 @contextmanager
-def team_of(size: int, device: torch.device) -> Iterator[Team]:
+def team_of(size: int, device: torch.device, arguments: Sequence[str] | None = None) -> Iterator[Team]:
     """The team of this process while the block runs: the one that it was started in, or a new one of ``size``.
 
-    A new team runs this very command, with its arguments, in ``size - 1`` helper processes, each on its share of the
-    cores. Errors: :class:`TeamError` when one of them fails.
+    A new team runs this very command, with its own or other ``arguments``, in ``size - 1`` helper processes, each on
+    its share of the cores. Errors: :class:`TeamError` when one of them fails, and for more than one on a GPU.
     """
     membership = os.environ.get(MEMBERSHIP)
+    if size > 1 and device.type == "cuda" and not under_torchrun():
+        raise TeamError(
+            f"{size} processes cannot share a GPU: torchrun --nproc-per-node={size} starts one for each GPU"
+        )
     if membership:
+        Thread(target=_end_with_leader, daemon=True).start()
         rank, size, port = (int(part) for part in membership.split())
         store = dist.TCPStore(LOCAL_ADDRESS, port, is_master=False)
         store.set(f"here/{rank}", "")
@@ -146,7 +153,7 @@ def team_of(size: int, device: torch.device) -> Iterator[Team]:
         threads = threads_of(size)
         torch.set_num_threads(threads)
         store = dist.TCPStore(LOCAL_ADDRESS, 0, is_master=True, wait_for_workers=False)
-        with _Helpers(size, store.port, threads) as helpers:
+        with _Helpers(size, store.port, threads, sys.argv[1:] if arguments is None else arguments) as helpers:
             helpers.wait_for(store)
             with _connected(device, store=store, rank=0, world_size=size), helpers.explaining():
                 yield Team(0, size)
@@ -157,10 +164,10 @@ def under_torchrun() -> bool:
     return "TORCHELASTIC_RUN_ID" in os.environ
 
 
-def own_device(device: torch.device) -> torch.device:
-    """``device``; under ``torchrun``, the GPU of this process's number on its machine where no other was named."""
-    if device.type == "cuda" and device.index is None and under_torchrun():
-        return torch.device("cuda", int(os.environ["LOCAL_RANK"]))
+def own_device(device: str) -> str:
+    """``device``; under ``torchrun``, for ``cuda`` and ``auto``, the GPU of this process's number on its machine."""
+    if under_torchrun() and device in ("auto", "cuda") and torch.cuda.is_available():
+        return f"cuda:{os.environ['LOCAL_RANK']}"
     return device
 
 
@@ -179,7 +186,7 @@ def _connected(device: torch.device, **place: Any) -> Iterator[None]:
 class _Helpers:
     """The other processes of a team that this one leads. They end with the block; what they print goes to a file."""
 
-    def __init__(self, size: int, port: int, threads: int) -> None:
+    def __init__(self, size: int, port: int, threads: int, arguments: Sequence[str]) -> None:
         self._open = ExitStack()
         self._logs: dict[int, IO[str]] = {}
         self._started: dict[int, subprocess.Popen[str]] = {}
@@ -187,7 +194,7 @@ class _Helpers:
             log = self._open.enter_context(tempfile.TemporaryFile("w+"))  # noqa: SIM115  # the stack closes it
             self._logs[rank] = log
             environment = {MEMBERSHIP: f"{rank} {size} {port}", "OMP_NUM_THREADS": str(threads)}
-            self._started[rank] = _start(log, environment)
+            self._started[rank] = _start(arguments, log, environment)
 
     def __enter__(self) -> _Helpers:
         return self
@@ -233,13 +240,20 @@ class _Helpers:
             time.sleep(POLL_SECONDS)
 
 
-def _start(log: IO[str], environment: dict[str, str]) -> subprocess.Popen[str]:
+def _end_with_leader() -> None:
+    """In a helper: wait for the end of the leader, however it comes, and end with it."""
+    sys.stdin.buffer.read()  # it writes nothing; its end of the pipe closes with it
+    os._exit(LEADER_IS_GONE)
+
+
+def _start(arguments: Sequence[str], log: IO[str], environment: dict[str, str]) -> subprocess.Popen[str]:
     """This command once more. A group of its own keeps the terminal's Ctrl-C from it: the leader ends the run."""
     module = sys.modules["__main__"].__spec__
     program = ["-m", module.name] if module else [sys.argv[0]]
     return subprocess.Popen(
-        [sys.executable, *program, *sys.argv[1:]],
+        [sys.executable, *program, *arguments],
         env=os.environ | environment,
+        stdin=subprocess.PIPE,
         stdout=log,
         stderr=subprocess.STDOUT,
         process_group=0,

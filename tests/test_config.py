@@ -114,6 +114,17 @@ def test_missing_key_is_named(key: str) -> None:
     [
         ("num_worlds=0", "num_worlds must be at least 1, got 0"),
         ("num_worlds=-4", "num_worlds must be at least 1, got -4"),
+        ("reward.arm_offset=[0.1]", "reward.arm_offset needs two numbers"),
+        ("reward.idle_base_xy=[1,2,3]", "reward.idle_base_xy needs two numbers"),
+        ("observation.policy=[]", "observation.policy must name at least one"),
+        ("algo.std=[{samples: 0, value: 0}]", "algo.std must be positive"),
+        ("algo.learning_rate=-1", "0 < learning_rate_min <= learning_rate"),
+        ("algo.learning_rate_min=0.1", "0 < learning_rate_min <= learning_rate"),
+        ("algo.actor_hidden=[0]", "algo.actor_hidden: a layer has at least 1 unit"),
+        ("algo.clip=-1", "algo.clip must be positive"),
+        ("algo.gae_lambda=3", r"algo.gae_lambda must lie in \(0, 1\]"),
+        ("predictor.learning_rate=-1", "predictor.learning_rate must be positive"),
+        ("predictor.hidden=[-3]", "predictor.hidden: a layer has at least 1 unit"),
         ("samples=0", "samples must be positive"),
         ("serve.vx=[-5.0,-6.0]", "serve.vx: low -5.0 is above high -6.0"),
         ("serve.x=[1.35]", r"serve.x must be \[low, high\]"),
@@ -141,6 +152,11 @@ def test_missing_key_is_named(key: str) -> None:
 def test_bad_value_is_named(override: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         parse(compose("train", [override]), TrainConfig)
+
+
+def test_the_fit_of_a_flight_knows_one_control_step() -> None:
+    with pytest.raises(ConfigError, match=r"features=flight needs robot.control_dt 0.02 s, got 0.01"):
+        load_train_config(["predictor=filter", "robot.control_dt=0.01"])
 
 
 def test_resume_and_init_from_exclude_each_other() -> None:

@@ -13,7 +13,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-FRAME = 0.02  # s, between sensed positions: the control step
+from pace.config import FLIGHT_DT as FRAME
+
 UNIT = 0.4  # s; times in the fits are in this unit, so that the sums are of order one
 NOISE = 0.004  # m, standard deviation of a sensed position (uniform +-7 mm)
 CONTACT_HEIGHT = 0.78  # m, centre of a ball on the table

@@ -206,13 +206,13 @@ RUN_KEYS: dict[str, Any] = {
 def export_weights(path: str | Path, folder: str | Path) -> Path:
     """Copy a checkpoint's weights and configuration without its training state, for ``pretrained/``.
 
-    Folders and the number of threads of the machine that trained it are left out of the configuration.
+    Folders, threads and CUDA graphs of the machine that trained it are left out of the configuration.
     """
     checkpoint = load_checkpoint(path, weights_only=True)
     slim = {part: {k: _single(v) for k, v in tensors.items()} for part, tensors in checkpoint.weights.items()}
     config = checkpoint.config | {key: value for key, value in RUN_KEYS.items() if key in checkpoint.config}
     if "engine" in config:
-        config["engine"] = config["engine"] | {"name": "auto", "threads": 0}
+        config["engine"] = config["engine"] | {"name": "auto", "threads": 0, "graph": "auto"}
     return save_checkpoint(Path(folder), Checkpoint(config, checkpoint.counters, slim, None))
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
-from pace.config import ConfigError, TrainConfig
-from pace.rl.loading import override_task
+from pace.config import TrainConfig
+from pace.rl.loading import stage_tasks
 
 Worlds = TypeVar("Worlds")
 
@@ -41,14 +41,3 @@ class Curriculum(Generic[Worlds]):
         self.stage = due
         self.worlds = self._make(self.tasks[due], due)
         return True
-
-
-def stage_tasks(config: TrainConfig) -> list[TrainConfig]:
-    """The configuration of each stage, the first of which is ``config``; each changes the one before."""
-    tasks = [config]
-    for stage in config.curriculum:
-        try:
-            tasks.append(override_task(tasks[-1], stage.task))
-        except ConfigError as error:
-            raise ConfigError(f"curriculum, from {stage.samples:g} control steps on: {error}") from error
-    return tasks

@@ -58,7 +58,8 @@ class TableTennisEnv(EnvBase):
         config: the task.
         num_worlds: N.
         device: ``auto``, ``cpu``, ``cuda``, ...
-        seed: of every random draw; the same seed on the same device repeats a run exactly.
+        seed: of every random draw; the same seed on the same device repeats a run exactly (but for MuJoCo Warp on a
+                GPU, which adds up in no fixed order).
         predictor: callable (N, 3 * frames) -> (N, P), used as it is at each step; ``None``: predictions are zero.
         worlds: simulation to use instead of a new one, on the same device and with its own generator.
 
@@ -291,7 +292,8 @@ class TableTennisEnv(EnvBase):
         return state | own | {"generator": self.generator.get_state()}
 
     def load_state_dict(self, state_dict: dict[str, Any], *args: Any, **kwargs: Any) -> None:  # type: ignore[override]
-        """Put back what :meth:`state_dict` returned; the next step is then the same, bit for bit.
+        """Put back what :meth:`state_dict` returned; the next step is then the same, bit for bit (but for MuJoCo
+        Warp on a GPU).
 
         Errors: ``KeyError`` for a missing tensor, ``RuntimeError`` for another shape (number of worlds, layout).
         """

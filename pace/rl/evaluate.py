@@ -86,7 +86,10 @@ def evaluate_table(
     context: Mapping[str, Any],
 ) -> None:
     """Play the rows that ``config`` names, print their table and write it with its figures into ``folder``."""
-    rows = [_with_bar(config, policy, name, name, config.serves, config.num_worlds, overrides) for name in config.rows]
+    rows = [
+        _with_bar(config, policy, name, name, config.serves, config.num_worlds, config.device, overrides)
+        for name in config.rows
+    ]
     folder.mkdir(parents=True, exist_ok=True)
     print(f"\n{tables(rows, config.paper)}\n")
     target = task.reward.terms["predicted_landing"].params
@@ -164,7 +167,9 @@ def play_cell(config: EvaluateConfig, policy: TaskPolicy, cell: Cell) -> list[di
     """Summaries of the rows of a cell."""
     label = cell.variation.label
     return [
-        _with_bar(config, policy, name, f"{label}, {name}", cell.serves, cell.worlds, cell.overrides).summary
+        _with_bar(
+            config, policy, name, f"{label}, {name}", cell.serves, cell.worlds, cell.device, cell.overrides
+        ).summary
         for name in config.sweep_rows
     ]
 
@@ -182,6 +187,7 @@ def _with_bar(
     label: str,
     serves: int,
     num_worlds: int,
+    device: str,
     overrides: Sequence[str],
 ) -> Row:
     """One row, with a progress bar of its serves."""
@@ -193,9 +199,7 @@ def _with_bar(
             bar.update(min(counted, serves) - bar.n)
 
         worlds = min(num_worlds, serves)
-        return evaluate_row(
-            policy, serve, serves, worlds, config.device, config.seed, overrides, config.warmup_serves, show
-        )
+        return evaluate_row(policy, serve, serves, worlds, device, config.seed, overrides, config.warmup_serves, show)
 
 
 def _announce(files: Sequence[Path]) -> None:

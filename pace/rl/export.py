@@ -41,7 +41,7 @@ from pace.sim.robot import JOINT_NAMES, build_model, joint_gains, motor_lines, n
 FORMAT = 2  # of the metadata; 2: kept says which outputs the caller keeps
 ACTION_NOISE = 0.3  # standard deviation added to the actions while observations are recorded, so that they vary
 #: The check plays the task as saved, but for noise that is added to what the graph itself computes.
-CHECK_OVERRIDES = ("sensing.base_shift=0.0", "engine=native", "engine.threads=1")
+CHECK_OVERRIDES = ("sensing.base_shift=0.0", "engine=native", "engine.threads=1", "engine.graph=auto")
 #: What lies outside the file.
 PROCEDURE = (
     "Run at 1 / control_dt Hz. Keep a history of each input, oldest frame first, and append a frame before each call: "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -129,14 +130,31 @@ def locate(path: str | Path) -> Path:
 
 
 def saved_config(checkpoint: Checkpoint) -> TrainConfig:
-    """The configuration that a checkpoint was trained with.
+    """The configuration that a checkpoint was trained with last: its task is that of the curriculum's stage.
 
     Errors: :class:`CheckpointError` when this version of pace does not know its keys.
     """
     try:
-        return parse(checkpoint.config, TrainConfig)
+        config = parse(checkpoint.config, TrainConfig)
+        return stage_tasks(config, checkpoint.counters.get("samples", 0.0))[-1]
     except (ConfigError, ValueError) as error:
         raise CheckpointError(f"{checkpoint.path} is of another version of pace: {error}") from error
+
+
+def stage_tasks(config: TrainConfig, samples: float = math.inf) -> list[TrainConfig]:
+    """``config``, and what each stage of its curriculum that has begun by ``samples`` makes of the one before.
+
+    Errors: :class:`ConfigError` for a change that the task does not know, which names the stage.
+    """
+    tasks = [config]
+    for stage in config.curriculum:
+        if stage.samples > samples:
+            break
+        try:
+            tasks.append(override_task(tasks[-1], stage.task))
+        except ConfigError as error:
+            raise ConfigError(f"curriculum, from {stage.samples:g} control steps on: {error}") from error
+    return tasks
 
 
 def policy_size(config: TrainConfig) -> int:

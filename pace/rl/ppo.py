@@ -119,7 +119,7 @@ class PPO:
         receive_critics()
         critic_norm = nn.utils.clip_grad_norm_(self.critic_parameters, self.config.max_grad_norm)
         self.critic_optimiser.step()
-        values = [out.get(name, torch.zeros(())) for name in LOSS_METRICS]
+        values = [out.get(name, self.loss.kl.new_zeros(())) for name in LOSS_METRICS]
         return torch.stack([v.detach().reshape(()) for v in (self.loss.kl, actor_norm, critic_norm, *values)])
 
     def _sources(self, rollout: Rollout) -> dict[str, Tensor]:

@@ -25,7 +25,7 @@ from pace.sim.render import Ball, Line, Mark
 Array = NDArray[np.float64]
 
 #: What a show changes in the saved task, before the user's own changes: the paper's evaluation, one world on a CPU.
-SHOW_OVERRIDES = ("serve=mixed", "reset=evaluation", "engine=native", "engine.threads=1")
+SHOW_OVERRIDES = ("serve=mixed", "reset=evaluation", "engine=native", "engine.threads=1", "engine.graph=auto")
 FLIGHT_DT = 0.01  # s between the points of a flight line
 FLIGHT_POINTS = 200
 FLIGHT_COLOUR = (0.95, 0.35, 0.1, 1.0)

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from pace.config import (
     EvaluateConfig,
     RandomizationConfig,
@@ -85,14 +87,15 @@ def _range(key: str, bounds: Sequence[float]) -> str:
 
 @dataclass(frozen=True)
 class Cell:
-    """A variation as it is played: the overrides of the saved task, serves a row and worlds, and the time that it takes
-    in serves of the fast engine.
+    """A variation as it is played: the overrides of the saved task, the device (the CPU for engine=native), serves a
+    row and worlds, and the time that it takes in serves of the fast engine.
 
     ``key`` tells what its figures depend on: cells of one key are played once, and found again in a sweep's file.
     """
 
     variation: Variation
     overrides: tuple[str, ...]
+    device: str
     serves: int
     worlds: int
     cost: float
@@ -117,6 +120,8 @@ def plan_cell(
     changed = (*overrides, *variation.overrides)
     task = override_task(policy.config, changed)
     task.engine.name = engine_name(task, device.type)
+    if task.engine.name == "native":
+        device = torch.device("cpu")
     slow = task.engine.name == "mjwarp" and device.type == "cpu"
     serves = config.sweep_serves_slow if slow else config.sweep_serves
     worlds = min(config.num_worlds, math.ceil(serves / SERVES_PER_WORLD))
@@ -124,7 +129,7 @@ def plan_cell(
     depends = [policy.source, dict(policy.counters), config.seed, config.warmup_serves, config.sweep_rows, serves]
     text = json.dumps([*depends, worlds, str(device), program, to_dict(task)], sort_keys=True)
     key = hashlib.sha256(text.encode()).hexdigest()[:16]
-    return Cell(variation, changed, serves, worlds, played * (SLOWNESS if slow else 1.0), key)
+    return Cell(variation, changed, str(device), serves, worlds, played * (SLOWNESS if slow else 1.0), key)
 
 
 def finished_cells(folder: Path, cells: Sequence[Cell]) -> Tables:

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 
 import torch
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from pace.command import run_command
@@ -30,7 +31,7 @@ from pace.rl.curriculum import Curriculum
 from pace.rl.progress import rate_texts
 from pace.rl.rollout import RolloutError
 from pace.rl.run_folder import CURVE, METRICS, RunFolder, default_run_dir
-from pace.rl.trainer import Summary, Trainer
+from pace.rl.trainer import Summary, Trainer, begins_anew, played_on
 from pace.sim.engine import resolve_device
 from pace.team import Team, TeamError, own_device, suitable_size, team_of, threads_of
 
@@ -51,15 +52,19 @@ def main() -> int:
 def train_from_config(composed: DictConfig) -> None:
     """Train as the composed configuration says, and print what was written."""
     config = parse(composed, TrainConfig)
+    hydra = HydraConfig.get()
+    overrides = list(hydra.overrides.task)
     if config.resume:
-        overrides = list(HydraConfig.get().overrides.task)
         saved = load_checkpoint(config.resume)
         config = resumed_config(saved, config.resume, overrides)
     else:
         saved = None
-    device = own_device(resolve_device(config.device))
+    device = resolve_device(own_device(config.device))
+    if saved and device.type != played_on(saved) and not any(key.startswith("processes=") for key in overrides):
+        config.processes = 0  # as many as suit this kind of device
     config.processes = config.processes or suitable_size(config.num_worlds, device)
-    with team_of(config.processes, device) as team:
+    arguments = overrides if hydra.mode == RunMode.MULTIRUN else None  # of this job; the command's are of all
+    with team_of(config.processes, device, arguments) as team:
         trainer = build_trainer(config, saved, device, team)
         if trainer.run is not None:
             announce(trainer, trainer.run, saved)
@@ -97,27 +102,32 @@ def build_trainer(config: TrainConfig, saved: Checkpoint | None, device: torch.d
     start = first_weights(config)
     torch.manual_seed(config.seed)
     predictor = PredictorNetwork(config.predictor).to(device)
-    make = partial(make_worlds, device=device, team=team, predictor=predictor)
+    anew = saved is not None and begins_anew(saved, team, device)
+    again = int(saved.counters["updates"]) if saved and anew else 0  # or the run's beginning would be drawn once more
+    make = partial(make_worlds, device=device, team=team, predictor=predictor, again=again)
     curriculum = Curriculum(config, make, saved.counters["samples"] if saved else 0.0)
     run = open_run(config, int(saved.counters["updates"]) if saved else 0) if team.leads else None
     trainer = Trainer(config, curriculum.worlds, predictor, run, team, curriculum)
-    torch.manual_seed(team.seed(config.seed))  # the networks began alike, what is played does not
+    torch.manual_seed(team.seed(config.seed + again))  # the networks began alike, what is played does not
     if saved:
         trainer.resume(saved)
     elif start:
-        trainer.load_weights(start)
+        trainer.start_from(start)
     return trainer
 
 
 def make_worlds(
-    task: TrainConfig, stage: int, device: torch.device, team: Team, predictor: PredictorNetwork
+    task: TrainConfig, stage: int, device: torch.device, team: Team, predictor: PredictorNetwork, again: int = 0
 ) -> TableTennisEnv:
-    """This process's worlds of one stage of the curriculum; each stage draws from random numbers of its own."""
+    """This process's worlds of one stage of the curriculum; each stage draws from random numbers of its own.
+
+    ``again``: another number makes other draws, for worlds that begin anew in a run.
+    """
     from pace.rl.env import TableTennisEnv
 
     threads = task.engine.threads or threads_of(team.size)
     task = replace(task, engine=replace(task.engine, threads=threads))
-    seed = team.seed(task.seed + SEEDS_APART * stage)
+    seed = team.seed(task.seed + SEEDS_APART * stage + again)
     return TableTennisEnv(task, task.num_worlds // team.size, device, seed, predictor)
 
 
@@ -146,8 +156,7 @@ def open_run(config: TrainConfig, first_update: int) -> RunFolder:
 def announce(trainer: Trainer, run: RunFolder, saved: Checkpoint | None) -> None:
     """Print what is about to be trained, on what, from what, and where it is kept."""
     if saved is not None:
-        before = len(saved.training["processes"]) if saved.training else 0
-        anew = f" of {before} processes, with worlds that begin anew" if before != trainer.team.size else ""
+        anew = ", with worlds that begin anew" if begins_anew(saved, trainer.team, trainer.device) else ""
         print(f"going on from {saved.path}{anew}")
     shared = f" in {trainer.team.size} processes" if trainer.team.size > 1 else ""
     agent = trainer.agent

@@ -264,7 +264,8 @@ class Trainer:
 
     def checkpoint(self) -> Checkpoint:
         """Everything that the next update depends on, of all processes of the team."""
-        own = {"random": torch.get_rng_state(), "env": self.env.state_dict()}
+        env = {key: value.cpu() if isinstance(value, Tensor) else value for key, value in self.env.state_dict().items()}
+        own = {"random": torch.get_rng_state(), "env": env}
         if self.device.type == "cuda":
             own["random_cuda"] = torch.cuda.get_rng_state(self.device)
         return Checkpoint(
@@ -279,7 +280,7 @@ class Trainer:
         )
 
     def load_weights(self, checkpoint: Checkpoint) -> None:
-        """Start from another run's policy, critic, normalisers and predictor, or from a predictor's weights alone.
+        """Take another run's policy, critic, normalisers and predictor over, or a predictor's weights alone.
 
         Errors: :class:`CheckpointError` for a missing or reshaped tensor.
         """
@@ -289,14 +290,22 @@ class Trainer:
             if part in checkpoint.weights:
                 cure = "; predictor_from=RUN takes another run's" if part == "predictor" else ""
                 load_weights(module, checkpoint.weights[part], f"{checkpoint.path} ({part}{cure})")
+        self.agent.choose_dtype()
+
+    def start_from(self, checkpoint: Checkpoint) -> None:
+        """:meth:`load_weights`, with the spread that this run begins with.
+
+        Errors: those of :meth:`load_weights`.
+        """
+        self.load_weights(checkpoint)
         self.agent.actor.bound_std(self.config.algo.std_floor, self.config.algo.std[0].value)
         self.agent.choose_dtype()
 
     def resume(self, checkpoint: Checkpoint) -> None:
         """Go on exactly where ``checkpoint`` was written.
 
-        Another number of processes than wrote it has the same networks, optimisers and counters, and worlds that begin
-        anew.
+        Where :func:`begins_anew` says so, the worlds are those that the environment has just made. MuJoCo Warp on a GPU
+        adds up in no fixed order: there it goes on from the same state, and not bit for bit the same.
 
         Errors: :class:`CheckpointError` when it holds weights only or does not fit this configuration.
         """
@@ -307,10 +316,8 @@ class Trainer:
         try:
             self.ppo.load_state_dict(state["ppo"])
             self.regression.load_state_dict(state["regression"])
-            if len(state["processes"]) == self.team.size:
+            if not begins_anew(checkpoint, self.team, self.device):
                 self._resume_play(state["processes"][self.team.rank])
-            else:  # none of what was drawn at the start of the run is drawn again
-                torch.manual_seed(self.team.seed(self.config.seed + int(checkpoint.counters["updates"])))
         except (KeyError, ValueError, RuntimeError) as error:
             raise CheckpointError(f"{checkpoint.path} does not fit this configuration: {error}") from error
         self.updates, self.samples = int(checkpoint.counters["updates"]), int(checkpoint.counters["samples"])
@@ -322,6 +329,18 @@ class Trainer:
         torch.set_rng_state(own["random"])
         if self.device.type == "cuda" and "random_cuda" in own:
             torch.cuda.set_rng_state(own["random_cuda"], self.device)
+
+
+def begins_anew(checkpoint: Checkpoint, team: Team, device: torch.device) -> bool:
+    """Whether a run that resumes ``checkpoint`` has new worlds: other processes wrote it, or another kind of device."""
+    played = checkpoint.training["processes"] if checkpoint.training else []
+    return len(played) != team.size or played_on(checkpoint) != device.type
+
+
+def played_on(checkpoint: Checkpoint) -> str:
+    """Kind of device, cpu or cuda, that the worlds of a checkpoint's run were on."""
+    played = checkpoint.training["processes"] if checkpoint.training else []
+    return "cuda" if any("random_cuda" in own for own in played) else "cpu"
 
 
 def summarise(statistics: dict[str, Tensor], control_dt: float, team: Team | None = None) -> dict[str, float]:

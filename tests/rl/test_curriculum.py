@@ -11,7 +11,8 @@ import torch
 
 from pace.config import ConfigError, Stage, TrainConfig, load_train_config
 from pace.rl.checkpoint import load_checkpoint
-from pace.rl.curriculum import Curriculum, stage_tasks
+from pace.rl.curriculum import Curriculum
+from pace.rl.loading import load_policy, stage_tasks
 from pace.rl.milestones import read_metrics
 from pace.rl.train import main
 from tests.rl.fakes import config
@@ -80,6 +81,7 @@ def test_a_run_changes_its_task_and_resumes_exactly(tmp_path: Path, monkeypatch:
     assert torch.equal(*delay)
     assert float(delay[0].max()) > 0.5  # control steps: later than the paper's
     assert read_metrics(tmp_path / "whole" / "metrics.csv")["stage"] == [0, 0, 1, 1]
+    assert load_policy(tmp_path / "whole").config.sensing.name == "wide"  # what it was trained for last
 
 
 @pytest.mark.parametrize(

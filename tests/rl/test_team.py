@@ -27,8 +27,8 @@ from pace.rl.milestones import read_metrics
 from pace.rl.policy import Agent, RunningNorm
 from pace.rl.ppo import PPO
 from pace.rl.rollout import Rollout
-from pace.rl.trainer import Trainer, summarise
-from pace.team import Team, suitable_size
+from pace.rl.trainer import Trainer, begins_anew, summarise
+from pace.team import Team, TeamError, own_device, suitable_size, team_of
 
 STEPS, WORLDS = 6, 32
 
@@ -204,6 +204,21 @@ def test_size_suits_the_machine(monkeypatch: pytest.MonkeyPatch) -> None:
         load_train_config(["num_worlds=1024", "processes=3"])
 
 
+def test_each_process_of_torchrun_has_its_own_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    assert own_device("cuda") == "cuda"
+    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "run")
+    monkeypatch.setenv("LOCAL_RANK", "3")
+    assert [own_device(name) for name in ("cuda", "auto", "cuda:1", "cpu")] == ["cuda:3", "cuda:3", "cuda:1", "cpu"]
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    assert own_device("auto") == "auto"
+
+
+def test_processes_of_this_machine_do_not_share_a_gpu() -> None:
+    with pytest.raises(TeamError, match="torchrun --nproc-per-node=2"), team_of(2, torch.device("cuda")):
+        pass
+
+
 def test_seeds_differ_between_processes_and_the_leaders_is_its_own() -> None:
     seeds = [Team(rank, 4).seed(seed) for seed in (1, 2) for rank in range(4)]
     assert len(set(seeds)) == 8
@@ -217,7 +232,13 @@ def test_another_number_of_processes_resumes_what_was_learned() -> None:
     first.update()
     saved = first.checkpoint()
     assert saved.training is not None
+    played = saved.training["processes"]
+    assert not begins_anew(saved, Team(), CPU)
+    assert begins_anew(saved, Team(), torch.device("cuda"))
     saved.training["processes"] = [{"env": "of worlds that are not these"}] * 2
+    assert begins_anew(saved, Team(), CPU)
+    second.resume(saved)
+    saved.training["processes"] = [{"env": "of worlds on a GPU", "random_cuda": played[0]["random"]}]
     second.resume(saved)
     assert (second.updates, second.samples) == (1, first.samples)
     again = second.checkpoint()
@@ -284,11 +305,27 @@ def test_two_processes_train_and_resume_exactly_and_one_goes_on_from_them(tmp_pa
     assert not torch.equal(first, second)  # each process plays worlds of its own
     status, out, err = finish(start(f"resume={parts}", f"samples={4 * UPDATE}", "progress=false", "processes=1"))
     assert status == 0, err
-    assert "update_00000003 of 2 processes, with worlds that begin anew" in out
+    assert "update_00000003, with worlds that begin anew" in out
     alone = load_checkpoint(parts)
     assert alone.counters["samples"] == 4 * UPDATE
     assert alone.weights["agent"]["policy_norm.count"].item() == 4 * UPDATE
     assert len(alone.training["processes"]) == 1  # type: ignore[index]
+
+
+def test_the_jobs_of_a_sweep_have_helpers_of_their_own(tmp_path: Path) -> None:
+    """Hydra's ``-m`` runs the command once for each value; a helper plays the task of its leader's job."""
+    run_dir = f"run_dir={tmp_path}/${{seed}}_${{sensing.name}}"
+    status, _, err = finish(
+        start("-m", "sensing=clean,wide", f"hydra.sweep.dir={tmp_path}", run_dir, f"samples={UPDATE}", *SMALL)
+    )
+    assert status == 0, err
+    delays = []
+    for name in ("clean", "wide"):
+        training = load_checkpoint(tmp_path / f"1_{name}").training
+        assert training is not None
+        delays.append([float(own["env"]["sensing._delay"].max()) for own in training["processes"]])
+    assert delays[0] == [0.0, 0.0]
+    assert min(delays[1]) > 0.5  # control steps
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="looks for child processes in /proc")
@@ -311,3 +348,13 @@ def test_ctrl_c_saves_and_a_lost_process_is_told(tmp_path: Path) -> None:
     status, _, err = finish(process)
     assert status == 1
     assert "error: process 1 of 2 ended with status -9" in err
+
+    process = start(f"run_dir={tmp_path / 'killed'}", "minutes=10", *SMALL)
+    wait_for_rows(tmp_path / "killed", process)
+    (orphan,) = children_of(process.pid)
+    process.kill()
+    finish(process)
+    deadline = time.monotonic() + 30.0
+    while Path(f"/proc/{orphan}").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not Path(f"/proc/{orphan}").exists()  # a helper ends with its leader

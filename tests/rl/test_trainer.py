@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import signal
 from dataclasses import replace
@@ -102,6 +103,21 @@ def test_two_and_two_updates_equal_four(tmp_path: Path) -> None:
     assert rows[0]["update"] == rows[1]["update"] == [1, 2, 3, 4]
     for column in ("mean_reward", "kl", "lr", "predictor_rmse_cm", "policy_std"):
         assert rows[0][column] == rows[1][column]
+
+
+def test_a_spread_that_may_rise_resumes_as_it_was(tmp_path: Path) -> None:
+    def trainer() -> Trainer:
+        config = make_config()
+        config.algo.std = [SchedulePoint(0.0, 0.5), SchedulePoint(1.0, 1.0)]
+        return Trainer(config, DummyTask(WORLDS), PredictorNetwork(config.predictor), None)
+
+    first, second = trainer(), trainer()
+    with torch.no_grad():
+        first.agent.actor.spread.state_independent_scale.fill_(math.log(0.8))
+    second.resume(first.checkpoint())
+    assert second.agent.actor.std[0].item() == pytest.approx(0.8)
+    second.start_from(first.checkpoint())  # a new run begins with its own
+    assert second.agent.actor.std[0].item() == pytest.approx(0.5)
 
 
 def test_later_updates_can_be_longer_and_resume_exactly(tmp_path: Path) -> None:
