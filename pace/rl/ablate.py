@@ -161,8 +161,7 @@ def draw(curves: Curves, file: Path) -> Path:
     figure = Figure(figsize=(11, 4.2), layout="constrained")
     for axes, rate in zip(figure.subplots(1, 2), ("hits", "returns"), strict=True):
         for number, (name, seeds) in enumerate(curves.items()):
-            style = {"color": f"C{number % COLOURS}", "ls": DASHES[number // COLOURS % len(DASHES)]}
-            _draw_experiment(axes, style, name.replace("_", " "), seeds, rate)
+            _draw_experiment(axes, number, name.replace("_", " "), seeds, rate)
         axes.set(xlabel="control steps, millions", ylabel=f"{rate}, % of serves")
         axes.set_ylim(bottom=0)
         axes.grid(alpha=0.3)
@@ -171,14 +170,13 @@ def draw(curves: Curves, file: Path) -> Path:
     return file
 
 
-def _draw_experiment(axes: Axes, style: dict[str, str], name: str, seeds: Sequence[Curve], rate: str) -> None:
+def _draw_experiment(axes: Axes, number: int, name: str, seeds: Sequence[Curve], rate: str) -> None:
     samples, values = over_seeds(seeds, rate)
     label = f"{name} ({len(seeds)} seed{'s' if len(seeds) > 1 else ''})"
-    axes.plot(samples / 1e6, 100 * np.median(values, 0), **style, label=label)
+    color, dash = f"C{number % COLOURS}", DASHES[number // COLOURS % len(DASHES)]
+    axes.plot(samples / 1e6, 100 * np.median(values, 0), color=color, ls=dash, label=label)
     if len(seeds) > 1:
-        axes.fill_between(
-            samples / 1e6, 100 * values.min(0), 100 * values.max(0), color=style["color"], alpha=0.15, lw=0
-        )
+        axes.fill_between(samples / 1e6, 100 * values.min(0), 100 * values.max(0), color=color, alpha=0.15, lw=0)
 
 
 def over_seeds(seeds: Sequence[Curve], rate: str) -> tuple[Array, Array]:
