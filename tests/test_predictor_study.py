@@ -95,3 +95,8 @@ def test_the_command_prints_a_table_and_writes_a_figure(
     assert printed.count("\n| rubber | ") == 3
     assert "| rubber | pace | " in printed
     assert (tmp_path / "predictor.png").stat().st_size > 10_000
+
+
+def test_a_predictor_that_is_not_there_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["predictor", "--cases", "rubber", "--predictors", str(tmp_path / "gone"), "--out", str(tmp_path)]) == 1
+    assert "gone does not exist" in capsys.readouterr().err

@@ -9,12 +9,16 @@ their figures.
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
 
+from pace.config import ConfigError
+from pace.rl.checkpoint import CheckpointError
+from pace.rl.loading import load_predictor
 from pace.studies import adaptation, motors, parity, posture, predictor, reaction, rounding, senses, steps
 from pace.studies.swings import Swings, policy_swings, random_swings
 
@@ -91,6 +95,8 @@ def _policies(options: argparse.Namespace) -> list[Path]:
 
 
 def study_predictor(options: argparse.Namespace) -> None:
+    for run in options.predictors:
+        load_predictor(run)  # wrong ones are told before minutes of bounds
     found = []
     for case in options.cases or predictor.CASES:
         found.append(predictor.compare(case, options.serves, options.predictors))
@@ -113,8 +119,8 @@ STUDIES = {
 }
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Run the studies that are named, or all."""
+def main(arguments: list[str] | None = None) -> int:
+    """Run the studies that are named, or all; returns the exit status."""
     parser = argparse.ArgumentParser(prog="python -m pace.studies", description=__doc__)
     parser.add_argument("studies", nargs="*", choices=[*STUDIES, []], help="which; none: all")
     parser.add_argument("--worlds", type=int, default=16, help="worlds of each case")
@@ -130,8 +136,13 @@ def main(arguments: list[str] | None = None) -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     for name in options.studies or STUDIES:
         print(f"\n== {name}")
-        STUDIES[name](options)
+        try:
+            STUDIES[name](options)
+        except (CheckpointError, ConfigError) as error:
+            print(f"error: {error}", file=sys.stderr)
+            return 1
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
