@@ -716,6 +716,7 @@ class AblateConfig:
     window: float  # control steps that a point of a curve averages over
     run_dir: str
     out: str | None  # null: run_dir
+    figure: str  # its name in out
     train: bool
     overrides: list[str]  # of the training
     progress: bool
@@ -728,6 +729,7 @@ class AblateConfig:
         for name in ("samples", "window"):
             _require(getattr(self, name) > 0, f"{name} must be positive, got {getattr(self, name)}")
         _require(self.jobs >= 1, f"jobs must be at least 1, got {self.jobs}")
+        _require(self.figure.endswith(".png"), f"figure must end in .png, got {self.figure}")
 
 
 def parse(config: DictConfig | dict[str, Any], schema: type[T]) -> T:

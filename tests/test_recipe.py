@@ -12,7 +12,7 @@ from pace.rl.ablate import run_name
 from pace.rl.milestones import Milestone, passage, read_curve
 
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "recipe"
-GONE = {"return_velocity_first"}  # the code of that reward term was replaced
+GONE = {"return_velocity_first", "campaign_first"}  # a reward term, and an observation, that were replaced
 
 
 def listed() -> list[dict[str, str]]:

@@ -29,7 +29,6 @@ from pace.rl.milestones import MILESTONES, Array, Curve, Milestone, markdown, pa
 from pace.rl.run_folder import METRICS
 from pace.rl.run_queue import Run, RunQueue, check_settings
 
-FIGURE = "ablation.png"
 DPI = 110
 COLOURS, DASHES = 10, ("-", "--", ":")  # of the figure: the next dash when the colours are used up
 #: Rate of a curve -> factor, unit and decimal places that it is shown with.
@@ -60,7 +59,7 @@ def ablate_from_config(composed: DictConfig) -> None:
     if config.train:
         failures = train(config, out)
     curves = read_curves(config, out)
-    print(f"\n{summary(curves)}\n\nwrote {draw(curves, out / FIGURE)}")
+    print(f"\n{summary(curves)}\n\nwrote {draw(curves, out / config.figure)}")
     if failures:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in failures.items())
         raise AblationError(f"{len(failures)} runs failed, the same command tries them again: {reasons}")

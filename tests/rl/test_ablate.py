@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from pace.config import AblateConfig, ConfigError, TrainConfig, compose, load_train_config, parse, to_dict
-from pace.rl.ablate import FIGURE, main, needed, over_seeds, planned_runs, summary
+from pace.rl.ablate import main, needed, over_seeds, planned_runs, summary
 from pace.rl.milestones import Curve, Milestone, read_metrics
 
+FIGURE = "some.png"
 TINY = (
     "num_worlds=8", "algo.steps=12", "algo.actor_hidden=[16]", "algo.critic_hidden=[16]",
     "predictor.batches_per_update=1", "tensorboard=false",
@@ -115,7 +116,7 @@ def test_every_experiment_gets_every_seed() -> None:
     runs = planned_runs(config)
     assert [run.name for run in runs] == ["full_seed4", "paper_reward_seed4", "full_seed5", "paper_reward_seed5"]
     assert runs[3].overrides == ("experiment=paper_reward", "seed=5")
-    for wrong in ("seeds=[]", "seeds=[1,1]", "jobs=0", "samples=0", "experiments=[]"):
+    for wrong in ("seeds=[]", "seeds=[1,1]", "jobs=0", "samples=0", "experiments=[]", "figure=a.svg"):
         with pytest.raises(ConfigError):
             parse(compose("ablate", [wrong]), AblateConfig)
 
@@ -124,7 +125,7 @@ def test_a_real_ablation_and_its_second_call(ablate, tmp_path: Path, capsys: pyt
     out = tmp_path / "out"
     common = (
         "experiments=[no_predictor,paper_reward]", "seeds=[3]", f"run_dir={tmp_path / 'runs'}", f"out={out}",
-        f"window={UPDATE}", "progress=false", *TINY,
+        f"window={UPDATE}", f"figure={FIGURE}", "progress=false", *TINY,
     )  # fmt: skip
     assert ablate(f"samples={2 * UPDATE}", "jobs=2", *common) == 0
     printed = capsys.readouterr().out
