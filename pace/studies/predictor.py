@@ -21,7 +21,6 @@ from pace.studies.posterior import Question, answer
 
 FRAMES = 46  # control steps, 0.9 s: past the apex of every serve
 CHAINS, STEPS = 4, 900
-PREDICTED_SERVES = 1024
 SEED = 5
 #: What is known at a time: so many of the last sensed positions.
 WINDOWS = {"bound, five positions": 5, "bound, whole flight": FRAMES}
@@ -60,24 +59,22 @@ def case_config(case: str, serves: int) -> TrainConfig:
 
 
 def compare(case: str, serves: int, runs: Sequence[Path] = ()) -> Errors:
-    """Bounds, at one instant of each of ``serves`` serves in each bin, and the predictors of ``runs``, at every instant
-    of PREDICTED_SERVES."""
+    """Bounds and the predictors of ``runs``, at the same instant of each of ``serves`` serves in each bin."""
     config = case_config(case, serves)
     recording = record(config, FRAMES)
     instants = instants_of(recording)
     rmse = {name: [_bound(config, recording, at, frames) for at in instants] for name, frames in WINDOWS.items()}
-    return Errors(case, rmse | {run.name: predicted_rmse(case, run) for run in runs})
+    return Errors(case, rmse | {run.name: predicted_rmse(case, serves, run, instants) for run in runs})
 
 
 @torch.no_grad()
-def predicted_rmse(case: str, run: Path) -> list[float]:
-    """RMSE (cm) of a saved predictor by ``BEFORE_APEX``."""
+def predicted_rmse(case: str, serves: int, run: Path, instants: Sequence[Tensor]) -> list[float]:
+    """RMSE (cm) of a saved predictor by ``BEFORE_APEX``, at ``instants`` of the serves that :func:`compare` plays."""
     predictor = load_predictor(run)
-    config = dataclasses.replace(case_config(case, PREDICTED_SERVES), predictor=predictor.config)
+    config = dataclasses.replace(case_config(case, serves), predictor=predictor.config)
     recording = record(config, FRAMES, predictor.network)
     error = recording.predicted - recording.apex.unsqueeze(1)
-    bins = _bins(recording)
-    return [_rmse(error[recording.valid & (bins == number)]) for number in range(1, len(BIN_NAMES))]
+    return [_rmse(error[at >= 0, at[at >= 0]]) for at in instants]
 
 
 def _bins(recording: Recording) -> Tensor:
