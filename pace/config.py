@@ -461,7 +461,7 @@ class AlgoConfig:
             _require(all(point.value > 0 for point in getattr(self, name)), f"algo.{name} must be positive")
 
 
-FLIGHT_DT = 0.02  # s, between the positions that ``predictor.features=flight`` fits
+FRAME_DT = 0.02  # s, between the positions that ``predictor.features=flight`` fits
 
 
 @dataclass
@@ -557,8 +557,8 @@ class TrainConfig(TaskConfig):
             self.processes == 0 or self.num_worlds % self.processes == 0,
             f"num_worlds {self.num_worlds} cannot be shared equally by {self.processes} processes",
         )
-        fits = self.predictor.features != "flight" or math.isclose(self.robot.control_dt, FLIGHT_DT)
-        _require(fits, f"predictor.features=flight needs robot.control_dt {FLIGHT_DT} s, got {self.robot.control_dt}")
+        fits = self.predictor.features != "flight" or math.isclose(self.robot.control_dt, FRAME_DT)
+        _require(fits, f"predictor.features=flight needs robot.control_dt {FRAME_DT} s, got {self.robot.control_dt}")
         _require(self.samples > 0, "samples must be positive")
         _require(self.minutes >= 0, f"minutes must not be negative (0: no limit), got {self.minutes}")
         _require(not (self.resume and self.init_from), "give resume or init_from, not both")

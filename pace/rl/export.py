@@ -33,7 +33,7 @@ from pace.config import ExportConfig, TrainConfig, parse, to_dict
 from pace.rl.checkpoint import CheckpointError
 from pace.rl.deployed import INPUTS, DeployedPolicy, input_ports, input_shapes, kept_outputs, output_ports
 from pace.rl.env import TableTennisEnv
-from pace.rl.loading import TaskPolicy, load_policy
+from pace.rl.loading import ON_A_CPU, TaskPolicy, load_policy
 from pace.rl.observations import POLICY, layout
 from pace.rl.run_folder import VERSIONS, git_state, versions
 from pace.sim.robot import JOINT_NAMES, build_model, joint_gains, motor_lines, nominal_pose
@@ -41,7 +41,7 @@ from pace.sim.robot import JOINT_NAMES, build_model, joint_gains, motor_lines, n
 FORMAT = 2  # of the metadata; 2: kept says which outputs the caller keeps
 ACTION_NOISE = 0.3  # standard deviation added to the actions while observations are recorded, so that they vary
 #: The check plays the task as saved, but for noise that is added to what the graph itself computes.
-CHECK_OVERRIDES = ("sensing.base_shift=0.0", "engine=native", "engine.threads=1", "engine.graph=auto")
+CHECK_OVERRIDES = ("sensing.base_shift=0.0", *ON_A_CPU)
 #: What lies outside the file.
 PROCEDURE = (
     "Run at 1 / control_dt Hz. Keep a history of each input, oldest frame first, and append a frame before each call: "

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 TASK_GROUPS = ("ball", "serve", "reset", "randomization", "sensing", "reward", "robot")
 #: Parts of a saved task of which single values may be changed.
 CHANGEABLE = (*TASK_GROUPS, "engine")
+#: Changes of a saved task that is played on a CPU, one world or a few, whatever it was trained on.
+ON_A_CPU = ("engine=native", "engine.threads=1", "engine.graph=auto")
 RANDOM_STD = 0.8  # of the random policy's actions: how widely a training run begins to explore
 
 

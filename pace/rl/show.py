@@ -16,7 +16,7 @@ from torch import Tensor
 
 from pace.config import TaskConfig
 from pace.rl.env import TableTennisEnv
-from pace.rl.loading import TaskPolicy, override_task
+from pace.rl.loading import ON_A_CPU, TaskPolicy, override_task
 from pace.rl.observations import Predictor
 from pace.rl.task import Outcome, ServeSampler
 from pace.sim.ball import BallParams, BallSim
@@ -25,7 +25,7 @@ from pace.sim.render import Ball, Line, Mark
 Array = NDArray[np.float64]
 
 #: What a show changes in the saved task, before the user's own changes: the paper's evaluation, one world on a CPU.
-SHOW_OVERRIDES = ("serve=mixed", "reset=evaluation", "engine=native", "engine.threads=1", "engine.graph=auto")
+SHOW_OVERRIDES = ("serve=mixed", "reset=evaluation", *ON_A_CPU)
 FLIGHT_DT = 0.01  # s between the points of a flight line
 FLIGHT_POINTS = 200
 FLIGHT_COLOUR = (0.95, 0.35, 0.1, 1.0)

@@ -290,7 +290,6 @@ class Trainer:
             if part in checkpoint.weights:
                 cure = "; predictor_from=RUN takes another run's" if part == "predictor" else ""
                 load_weights(module, checkpoint.weights[part], f"{checkpoint.path} ({part}{cure})")
-        self.agent.choose_dtype()
 
     def start_from(self, checkpoint: Checkpoint) -> None:
         """:meth:`load_weights`, with the spread that this run begins with.
@@ -313,6 +312,7 @@ class Trainer:
         if state is None:
             raise CheckpointError(f"{checkpoint.path} holds weights only: use init_from instead of resume")
         self.load_weights(checkpoint)
+        self.agent.choose_dtype()
         try:
             self.ppo.load_state_dict(state["ppo"])
             self.regression.load_state_dict(state["regression"])
@@ -327,20 +327,23 @@ class Trainer:
         """This process's worlds and random numbers, as :meth:`checkpoint` keeps them."""
         self.env.load_state_dict(own["env"])
         torch.set_rng_state(own["random"])
-        if self.device.type == "cuda" and "random_cuda" in own:
+        if "random_cuda" in own:
             torch.cuda.set_rng_state(own["random_cuda"], self.device)
 
 
 def begins_anew(checkpoint: Checkpoint, team: Team, device: torch.device) -> bool:
     """Whether a run that resumes ``checkpoint`` has new worlds: other processes wrote it, or another kind of device."""
-    played = checkpoint.training["processes"] if checkpoint.training else []
-    return len(played) != team.size or played_on(checkpoint) != device.type
+    return len(_processes(checkpoint)) != team.size or played_on(checkpoint) != device.type
 
 
 def played_on(checkpoint: Checkpoint) -> str:
     """Kind of device, cpu or cuda, that the worlds of a checkpoint's run were on."""
-    played = checkpoint.training["processes"] if checkpoint.training else []
-    return "cuda" if any("random_cuda" in own for own in played) else "cpu"
+    return "cuda" if any("random_cuda" in own for own in _processes(checkpoint)) else "cpu"
+
+
+def _processes(checkpoint: Checkpoint) -> list[dict[str, Any]]:
+    """What each process of a checkpoint's run kept of its own; nothing where only weights were."""
+    return checkpoint.training["processes"] if checkpoint.training else []
 
 
 def summarise(statistics: dict[str, Tensor], control_dt: float, team: Team | None = None) -> dict[str, float]:

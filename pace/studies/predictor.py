@@ -14,6 +14,7 @@ from torch import Tensor
 
 from pace.config import TrainConfig, compose, parse
 from pace.predictor.regression import BIN_NAMES, TIME_BINS
+from pace.rl.evaluation_report import bin_label
 from pace.rl.loading import load_predictor
 from pace.studies.common import COLOURS, markdown
 from pace.studies.flights import Recording, record
@@ -111,7 +112,7 @@ def _rmse(error: Tensor) -> float:
 
 def table(found: Sequence[Errors]) -> str:
     """A row for each case and bound or predictor."""
-    bins = [name.replace("_", " to ").replace("over to", "over").replace("s", " s") for name in BEFORE_APEX]
+    bins = [bin_label(name).replace("s", " s") for name in BEFORE_APEX]
     rows = [
         [errors.case, name, *(f"{value:.2f}" for value in values)]
         for errors in found
