@@ -120,8 +120,9 @@ def plan_cell(
     changed = (*overrides, *variation.overrides)
     task = override_task(policy.config, changed)
     task.engine.name = engine_name(task, device.type)
-    if task.engine.name == "native":
-        device = torch.device("cpu")
+    if task.engine.name == "native" and device.type == "cuda":
+        device, task.engine.graph = torch.device("cpu"), "auto"  # a GPU's graphs do not go with it
+        changed = (*changed, "engine.graph=auto")
     slow = task.engine.name == "mjwarp" and device.type == "cpu"
     serves = config.sweep_serves_slow if slow else config.sweep_serves
     worlds = min(config.num_worlds, math.ceil(serves / SERVES_PER_WORLD))

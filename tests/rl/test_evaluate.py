@@ -15,7 +15,7 @@ from saved import make_config, save_run
 from pace.command import collect_overrides, name_argument
 from pace.config import EvaluateConfig, compose, parse
 from pace.predictor.regression import BIN_NAMES
-from pace.rl import evaluate
+from pace.rl import evaluate, sweep
 from pace.rl.evaluation import COLUMNS, C, ServeRecorder, count_failures, evaluate_row, summarise, wilson
 from pace.rl.evaluation_report import clean, text_table
 from pace.rl.loading import built_in_policy, load_policy, override_task
@@ -336,6 +336,18 @@ def test_a_slow_engine_plays_fewer_serves_and_costs_more() -> None:
     assert (native.serves, native.worlds, native.cost) == (500, 125, 4 * 125 * 6)
     assert (warp.serves, warp.worlds, warp.cost) == (100, 25, 10 * 4 * 25 * 6)
     assert given.key == native.key != warp.key
+
+
+def test_native_cells_of_a_gpu_are_played_on_its_cpu_without_graphs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sweep, "resolve_device", lambda name: torch.device("cuda"))
+    config = parse(compose("evaluate", ["policy=zero"]), EvaluateConfig)
+    policy = built_in_policy("zero", 1)
+    policy.config.engine.graph = "always"
+    cell = plan_cell(Variation("engine", "native", ("engine=native",)), config, policy, (), {})
+    task = override_task(policy.config, cell.overrides)
+    assert (cell.device, task.engine.name, task.engine.graph) == ("cpu", "native", "auto")
+    given = plan_cell(Variation("as", "given", ()), config, policy, (), {})
+    assert (given.device, override_task(policy.config, given.overrides).engine.graph) == ("cuda", "always")
 
 
 def test_the_run_may_stand_anywhere_and_hold_any_sign(tmp_path: Path) -> None:
