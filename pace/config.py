@@ -139,10 +139,12 @@ class ServeConfig:
     end_height: float  # m; a ball below it ends the serve
     serves_per_episode: int  # 0: the worlds play on without end
     random_phase: bool  # first episodes begin at a random serve, so that resets spread over time
+    head_start: Range = field(default_factory=lambda: [0.0, 0.0])  # s of its flight that an episode's first serve skips
 
     def __post_init__(self) -> None:
         for name in ("x", "y", "z", "vx", "vy", "vz", "spin"):
             _check_range(f"serve.{name}", getattr(self, name))
+        _check_range("serve.head_start", self.head_start, 0.0)
         _require(self.max_duration > 0, "serve.max_duration must be positive")
         _require(self.serves_per_episode >= 0, "serve.serves_per_episode must be 0 (no end) or more")
 

@@ -127,6 +127,7 @@ def test_missing_key_is_named(key: str) -> None:
         ("predictor.hidden=[-3]", "predictor.hidden: a layer has at least 1 unit"),
         ("samples=0", "samples must be positive"),
         ("serve.vx=[-5.0,-6.0]", "serve.vx: low -5.0 is above high -6.0"),
+        ("serve.head_start=[-0.1,0.2]", "serve.head_start: -0.1 is below 0.0"),
         ("serve.x=[1.35]", r"serve.x must be \[low, high\]"),
         ("ball.table_restitution=1.2", r"ball.table_restitution must lie in \[0, 1\]"),
         ("ball.mass=0", "ball.mass must be positive"),

@@ -26,7 +26,7 @@ from pace.rl.observations import (
 from pace.rl.rewards import RewardManager
 from pace.rl.state import TaskState
 from pace.rl.statistics import Statistics
-from pace.rl.task import Game, PoseSampler, ServeSampler
+from pace.rl.task import Game, HeadStart, PoseSampler, ServeSampler
 from pace.sim.graph import CapturedCall, graphs_wanted
 from pace.sim.sensing import Sensing
 from pace.sim.snapshot import restore, snapshot, under_prefix, with_prefix
@@ -94,6 +94,8 @@ class TableTennisEnv(EnvBase):
         config, worlds, device = self.config, self.worlds, self.worlds.device
         reward = config.reward
         self._serves = ServeSampler(config.serve, self.num_worlds, self.generator, device)
+        late = config.serve.head_start[1] > 0
+        self._head_start = HeadStart(config.serve, worlds.ball, self.generator) if late else None
         limits = (worlds.joint_lower, worlds.joint_upper)
         self._poses = PoseSampler(
             config.reset, config.robot, self.num_worlds, worlds.nominal, limits, worlds.joint_names, self.generator
@@ -196,7 +198,7 @@ class TableTennisEnv(EnvBase):
         qpos, qvel = self._poses.sample(mask)
         self.worlds.reset_robot(mask, qpos, qvel)
         self.game.clock.start_episode(mask, self.generator)
-        self._start_serves(mask)
+        self._start_serves(mask, self._head_start)
         for action in (self.task_state.action, self.task_state.previous_action):
             action.masked_fill_(mask.unsqueeze(-1), 0.0)
         self.sensing.reset(mask, self.worlds.robot, self.worlds.ball.position)
@@ -218,8 +220,10 @@ class TableTennisEnv(EnvBase):
         self._forecast_return(self.game.referee.hit_now)
         self.game.close()
 
-    def _start_serves(self, mask: Tensor) -> None:
+    def _start_serves(self, mask: Tensor, head_start: HeadStart | None = None) -> None:
         self.worlds.serve(mask, *self._serves.sample(mask))
+        if head_start is not None:
+            head_start.give(mask)
         self._forecast_serve(mask)
         self.game.start_serve(mask)
 

@@ -17,6 +17,7 @@ from torch import Tensor
 from pace.config import ConfigError, RewardConfig
 from pace.rl.state import TaskState
 from pace.sim.aero import GRAVITY
+from pace.sim.ball import BallParams
 
 Params = Mapping[str, float]
 Term = Callable[[TaskState, Params], Tensor]
@@ -101,6 +102,37 @@ def arrival(state: TaskState, params: Params) -> Tensor:
     return torch.exp(closeness.nearest * (-1.0 / params["sigma"])) * closeness.arrived_now
 
 
+@term("x", "y", "z", "time", "reach", "sigma")
+def swing(state: TaskState, params: Params) -> Tensor:
+    """How well the paddle moves and faces, about the time of the hit: as if to return the forecast ball to (x, y, z).
+
+    The ball arrives with its forecast velocity and should leave as :func:`return_velocity` asks. Without friction the
+    impulse is along the paddle's normal, so the wanted normal lies along the ball's change of velocity, and the
+    restitution of this world's paddle tells how fast the paddle has to go that way:
+    max(0, 1 - e / reach) |n . n_wanted| exp(-((t - t_hit) / sigma)^2), e the error of the paddle's velocity, m/s.
+    """
+    target, paddle, material = state.game.target, state.robot, state.ball.params
+    change = _good_return(target.point, params) - target.arriving
+    speed = _length(change)
+    normal = change / speed.unsqueeze(-1)
+    velocity = normal * paddle_speed(target.arriving, normal, speed, material).unsqueeze(-1)
+    moves = (1.0 - _length(paddle.paddle_velocity - velocity) / params["reach"]).clamp_(min=0.0)
+    faces = (paddle.paddle_normal * normal).sum(1).abs_()
+    early = (target.time - state.game.clock.time) / params["sigma"]
+    return moves * faces * early.square_().neg_().exp_() * state.something_to_hit
+
+
+def paddle_speed(arriving: Tensor, normal: Tensor, change: Tensor, material: BallParams) -> Tensor:
+    """Speed (N,), m/s, that a paddle needs along its unit ``normal`` (N, 3) to change the velocity of a ball that is
+    ``arriving`` (N, 3), m/s, by ``change`` (N,), m/s: the rebound of :mod:`pace.sim.rebound`, inverted.
+
+    They close at c with (1 + e(c)) c = change, where e(c) falls linearly with c, its floor left out.
+    """
+    lively = 1.0 + torch.as_tensor(material.paddle_restitution)
+    root = (lively.square() - 4.0 * material.paddle_restitution_slope * change).clamp(min=0.0).sqrt()
+    return 2.0 * change / (lively + root) + (arriving * normal).sum(1)
+
+
 # --- after the hit ----------------------------------------------------------------------------------------------------
 
 
@@ -131,10 +163,15 @@ def return_velocity(state: TaskState, params: Params) -> Tensor:
     this term leads across.
     """
     events = state.ball.events
-    time, lifted = params["time"], params["z"] + 0.5 * GRAVITY * params["time"] ** 2
-    aim = _constant((params["x"] / time, params["y"] / time, lifted / time), events.hit_position.device)
-    error = torch.add(events.hit_velocity_out, events.hit_position, alpha=1.0 / time).sub_(aim)
+    error = events.hit_velocity_out - _good_return(events.hit_position, params)
     return (1.0 - _length(error) / params["reach"]).clamp_(min=0.0) * state.game.referee.hit_now
+
+
+def _good_return(position: Tensor, params: Params) -> Tensor:
+    """Velocity (N, 3), m/s, that takes a ball from ``position`` (N, 3), m, to (x, y, z) in ``time``, without air."""
+    time, lifted = params["time"], params["z"] + 0.5 * GRAVITY * params["time"] ** 2
+    aim = _constant((params["x"] / time, params["y"] / time, lifted / time), position.device)
+    return torch.add(aim, position, alpha=-1.0 / time)
 
 
 @term("at_hit")

@@ -25,7 +25,7 @@ from pace.sim.snapshot import restore, snapshot, under_prefix, with_prefix
 if TYPE_CHECKING:
     from pace.sim.ball import BallSim
 
-__all__ = ["Game", "Outcome", "PoseSampler", "ServeSampler"]
+__all__ = ["Game", "HeadStart", "Outcome", "PoseSampler", "ServeSampler"]
 
 
 class ServeSampler:
@@ -46,6 +46,20 @@ class ServeSampler:
         """
         self._draw(mask)
         return self._launch
+
+
+class HeadStart:
+    """Puts balls that are being served somewhere further on their way, by a time drawn from ``config.head_start``."""
+
+    def __init__(self, config: ServeConfig, ball: BallSim, generator: torch.Generator) -> None:
+        duration = torch.zeros(ball.num_worlds, device=ball.device)
+        self._draw = Draws([Column(duration, *config.head_start)], generator)
+        self._skip = ball.skipper(duration)
+
+    def give(self, mask: Tensor) -> None:
+        """Another time for each world of ``mask`` (N,) bool; its ball moves on by that."""
+        self._draw(mask)
+        self._skip(mask)
 
 
 class PoseSampler:
@@ -132,7 +146,8 @@ class Target(Part):
     """Where and when the paddle should meet the ball: from the forecast of the serve. World frame, serve clock.
 
     Attributes: ``playable`` (N,) bool, ``apex`` (N, 3) m, ``apex_time`` (N,) s, ``point`` (N, 3) m the paddle's
-    target, ``time`` (N,) s when the ball is there; ``something_to_hit`` (N,) bool, the ball can still be hit legally;
+    target, ``time`` (N,) s when the ball is there, ``arriving`` (N, 3) m/s its velocity at the later of the apex and
+    ``reward.target_x``; ``something_to_hit`` (N,) bool, the ball can still be hit legally;
     ``idle_point`` (3,) m: a target to stand by while there is nothing to hit, the one that belongs to the idle base
     position.
     """
@@ -143,6 +158,7 @@ class Target(Part):
         self.something_to_hit = torch.zeros(num_worlds, dtype=torch.bool, device=device)
         self.apex = self.idle_point.repeat(num_worlds, 1)
         self.point = self.idle_point.repeat(num_worlds, 1)
+        self.arriving = torch.zeros(num_worlds, 3, device=device)
         self.apex_time = torch.zeros(num_worlds, device=device)
         self.time = torch.zeros(num_worlds, device=device)
 
@@ -288,7 +304,7 @@ class Game:
         distances = [share(ball.nearest_paddle_distance), share(radius)]
         inputs = [game, events, forecast, position, velocity, *distances, share(base_position), self.rules]
         self._close = record(task_kernels.close, count, inputs, device)
-        inputs = [share(self._mask), game, forecast, position, velocity, self.rules]
+        inputs = [share(self._mask), game, forecast, position, velocity, share(self.target.arriving), self.rules]
         self._start = record(task_kernels.start_serve, count, inputs, device)
 
     def judge(self) -> None:

@@ -300,6 +300,7 @@ def start_serve(
     forecast: ForecastArrays,
     position: wp.array[wp.vec3],
     velocity: wp.array[wp.vec3],
+    arriving: wp.array[wp.vec3],
     rules: Rules,
 ):
     """Begin the serve whose flight was forecast, in the masked worlds."""
@@ -307,6 +308,9 @@ def start_serve(
     if not mask[world]:
         return
     _aim(game, forecast, rules, world)
+    arriving[world] = wp.vec3(0.0)
+    if game.playable[world] and not wp.isnan(forecast.intercept_time[world]):
+        arriving[world] = forecast.intercept_velocity[world]
     outcome = int(BAD_SERVE)
     if game.playable[world]:
         outcome = OPEN

@@ -21,6 +21,7 @@ from pace.sim.ball_kernels import (
     ForecastArrays,
     fly_step,
     forecast_flight,
+    skip_flight,
 )
 from pace.sim.flight import Scene
 from pace.sim.rebound import Material
@@ -329,3 +330,19 @@ class BallSim:
             launch()
 
         return ahead
+
+    def skipper(self, duration: Tensor) -> Callable[[Tensor], None]:
+        """A function of a mask (N,) bool that moves those balls on by ``duration`` (N,) s of their flight at once.
+
+        No further than to where they are about to touch something; nothing is hit and nothing is noted.
+        """
+        mask = torch.zeros(self.num_worlds, dtype=torch.bool, device=self.device)
+        state = [share(mask), share(duration), share(self.position), share(self.velocity), share(self.spin)]
+        inputs = [*state, wp.from_torch(self._param_matrix), self._scene, self._ball_dt]
+        launch = record(skip_flight, self.num_worlds, inputs, self.device)
+
+        def skip(chosen: Tensor) -> None:
+            mask.copy_(chosen)
+            launch()
+
+        return skip

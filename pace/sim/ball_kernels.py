@@ -1,4 +1,7 @@
-"""The two kernels of :class:`pace.sim.ball.BallSim`: a control step with events, and a forecast. One thread a world."""
+"""The kernels of :class:`pace.sim.ball.BallSim`: a control step with events, a forecast, and a flight that is skipped.
+
+One thread a world.
+"""
 
 import warp as wp
 
@@ -357,3 +360,35 @@ def forecast_flight(
         known = not (wp.isnan(forecast.landing_time[world]) or wp.isnan(forecast.intercept_time[world]))
         if known or leg.surface == FLOOR or flight.clock >= _HORIZON * 0.999999:
             return
+
+
+@wp.kernel
+def skip_flight(
+    mask: wp.array[wp.bool],
+    duration: wp.array[wp.float32],
+    position: wp.array[wp.vec3],
+    velocity: wp.array[wp.vec3],
+    spin: wp.array[wp.vec3],
+    params: wp.array2d[wp.float32],
+    scene: Scene,
+    ball_dt: float,
+):
+    """Move the ball of each masked world on by ``duration`` s without a paddle, or to the last sub-step in the air."""
+    world = wp.tid()
+    if not mask[world]:
+        return
+    body = read_body(params, world)
+    flight = Flight()
+    flight.position = position[world]
+    flight.velocity = velocity[world]
+    flight.spin = spin[world]
+    flight.gaps = gaps_to(STATIC_SURFACES, flight.position, 0.0, body.radius, scene, world)
+    for _leg in range(_MAX_FORECAST_LEGS):
+        remaining = duration[world] - flight.clock
+        if remaining <= 0.0:
+            return
+        flight, leg = fly_leg(flight, STATIC_SURFACES, 0.0, remaining, ball_dt, body, scene, world)
+        if leg.surface != NOTHING:
+            return
+        position[world] = flight.position
+        velocity[world] = flight.velocity

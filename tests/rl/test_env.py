@@ -132,6 +132,19 @@ def test_starts_lie_in_the_configured_ranges() -> None:
     assert bool((env.game.referee.outcome == Outcome.OPEN).all())
 
 
+def test_an_episode_may_begin_in_the_middle_of_a_serve() -> None:
+    env = make(1, "serve.head_start=[0.1,0.3]")
+    env.reset_worlds(torch.ones(N, dtype=torch.bool))
+    way = 1.35 - env.worlds.ball.position[:, 0]
+    assert 0.1 * 4.5 < way.min() < way.max() < 0.3 * 6.5  # m, of serves of 5.0 to 6.5 m/s that the air slows down
+    assert len(way.unique()) == N
+    assert bool((env.game.referee.outcome == Outcome.OPEN).all())
+    track = env.predictor_input.view(N, -1, 3)[:, -1, 0]
+    torch.testing.assert_close(track, env.worlds.ball.position[:, 0], atol=0.1, rtol=0.0)  # noise and delay
+    finish_serve(env, torch.arange(N) == 1)
+    assert float(env.worlds.ball.position[1, 0]) == pytest.approx(1.35)  # the next one is served
+
+
 def test_a_fall_terminates_and_the_serve_counts_as_a_fall() -> None:
     env = make()
     qpos = env.worlds.engine.qpos_path[:, -1].clone()

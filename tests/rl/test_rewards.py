@@ -10,9 +10,13 @@ from typing import Any
 import pytest
 import torch
 
-from pace.config import ConfigError, RewardConfig, RewardTerm
-from pace.rl.rewards import TERMS, RewardFunction, RewardManager
+from torch import Tensor
+
+from pace.config import ConfigError, RewardConfig, RewardTerm, load_train_config
+from pace.rl.rewards import TERMS, RewardFunction, RewardManager, paddle_speed
 from pace.rl.state import JOINT_GROUPS, TaskState
+from pace.sim.aero import GRAVITY
+from pace.sim.ball import BallParams, BallSim
 from tests.rl.fakes import CPU, JOINT_NAMES, config, fake_state, set_events
 
 PAPER_TASK = config("reward=paper")
@@ -41,7 +45,7 @@ def play(state: TaskState, distance: float, **times: Any) -> None:
 
 
 def test_every_term_of_the_paper_is_there_and_every_term_is_tested() -> None:
-    assert set(PACE.terms) == set(TERMS)
+    assert set(PACE.terms) | {"swing"} == set(TERMS)
     assert set(PACE.terms) - set(PAPER.terms) == {"arrival", "ready_stance", "return_velocity"}
 
 
@@ -176,6 +180,49 @@ def test_return_velocity() -> None:
     assert value("return_velocity", state, PACE) == 0.0
     play(state, 0.5)
     assert value("return_velocity", state, PACE) == 0.0  # once
+
+
+def swung(arriving: Tensor, point: Tensor, speed: Tensor, normal: Tensor, params: BallParams) -> Tensor:
+    """Velocity of a ball that meets at ``point`` a paddle which moves along its normal: the simulation's own rebound."""
+    table, dt = config().ball.table, 0.02
+    sim = BallSim(1, CPU, params, table, dt, 1, 0.004)
+    fall = torch.tensor([0.0, 0.0, GRAVITY]) * 0.5 * dt
+    sim.position[:], sim.velocity[:] = point - 0.5 * dt * (arriving + 0.5 * fall), arriving + fall
+    gap = 0.02 + table.paddle_half_thickness
+    path = torch.zeros(1, 2, 12)
+    for knot, time in enumerate((-0.5 * dt, 0.5 * dt)):
+        path[0, knot] = torch.cat([point - gap * normal + time * speed * normal, normal, speed * normal, torch.zeros(3)])
+    sim.fly(path)
+    assert sim.events.paddle_hit[0] == 1
+    return sim.events.hit_velocity_out[0]
+
+
+def test_a_perfect_swing_is_one_that_returns_the_ball() -> None:
+    reward = load_train_config(["experiment=swing"]).reward
+    state = fake_state()
+    material = BallParams.from_config(config().ball)
+    material = replace(material, paddle_friction=0.0, drag_coefficient=0.0, magnus_coefficient=0.0)
+    state.ball.params = material
+    target, robot = state.game.target, state.robot
+    target.arriving[:] = torch.tensor([-4.2, 0.3, -0.5])
+    target.point[:], target.time[:] = torch.tensor([-1.6, -0.2, 1.1]), float(state.game.clock.time[0])
+    wanted = torch.tensor([6.2, 0.4, 1.8125])  # to (1.5, 0, 0.78) in 0.5 s, worked out as in test_return_velocity
+    change = wanted - target.arriving[0]
+    normal = change / change.norm()
+    speed = paddle_speed(target.arriving, normal[None], change.norm()[None], material)[0]
+    assert 0.5 < speed < 4.0
+    out = swung(target.arriving[0], target.point[0], speed, normal, material)
+    torch.testing.assert_close(out, wanted, atol=1e-3, rtol=0.0)
+    robot.paddle_normal[:], robot.paddle_velocity[:] = normal, speed * normal
+    assert value("swing", state, reward) == pytest.approx(1.0, abs=1e-5)
+    robot.paddle_normal[:] = -normal
+    assert value("swing", state, reward) == pytest.approx(1.0, abs=1e-5)  # the back of the blade returns as well
+    robot.paddle_velocity[:] = speed * normal + torch.tensor([0.0, 2.0, 0.0])
+    assert value("swing", state, reward) == pytest.approx(0.75, abs=1e-5)
+    target.time[:] += 0.1
+    assert value("swing", state, reward) == pytest.approx(0.75 * math.exp(-1), abs=1e-5)
+    state.something_to_hit[:] = False
+    assert float(TERMS["swing"].function(state, reward.terms["swing"].params)[0]) == 0.0
 
 
 def test_predicted_net_height() -> None:

@@ -81,6 +81,27 @@ def test_flights_to_bounce_and_apex_agree_with_the_ode_solution():
     np.testing.assert_allclose(apex, serves.flight.apex, atol=2e-5)
 
 
+def test_a_skipped_flight_is_the_one_that_is_flown():
+    serves = reference.random_serves(100)
+    given = {f.name: torch.tensor(getattr(serves.ball, f.name)) for f in fields(serves.ball)}
+    params = BallParams(**given, paddle_restitution=0.8, paddle_restitution_slope=0.0, paddle_friction=0.3)
+    skipped, flown = make_sim(100, params), make_sim(100, params)
+    for sim in (skipped, flown):
+        put(sim, serves.position, serves.velocity, serves.spin)
+    start, steps, chosen = skipped.position.clone(), 12, torch.arange(100) % 3 > 0
+    assert serves.flight.bounce_time.min() > steps * DT
+    skipped.skipper(torch.full((100,), steps * DT))(chosen)
+    fly_steps(flown, steps)
+    wide = chosen.unsqueeze(1)
+    torch.testing.assert_close(skipped.position, torch.where(wide, flown.position, start), atol=1e-5, rtol=0.0)
+    torch.testing.assert_close(skipped.velocity[chosen], flown.velocity[chosen], atol=1e-5, rtol=0.0)
+    skipped.skipper(torch.full((100,), 3.0))(chosen)  # much more than is left
+    above = skipped.position[chosen, 2] - TOP - params.radius[chosen]
+    assert 0.0 <= above.min()
+    assert above.max() < 0.05
+    assert (skipped.velocity[chosen, 2] < 0).all()
+
+
 @pytest.mark.parametrize("preset", PRESETS)
 def test_ittf_drop_test(preset: str):
     """From 30.5 cm a ball comes back to 24 to 26 cm; without air to e^2 of the height."""
