@@ -127,8 +127,11 @@ def test_with_the_limit_no_motor_drives_over_its_line(tmp_path: Path) -> None:
         assert (use.serves, len(use.fastest)) == (2, 21)
         assert (use.fast[use.fastest <= 1.0] == 0).all()
         assert (use.fast[use.fastest > 1.0] > 0).all()
+        assert (use.over <= use.held).all()
+        assert (use.excess[use.over > 0] > 0).all()
     assert [use.case for use in found] == [motors.WITHOUT, motors.WITH]
     assert (found[1].over == 0).all()
+    assert found[1].excess.max() < 0.01
     assert motors.table(found).count("\n") == 2 + len(motors.GROUPS)
 
 

@@ -115,18 +115,25 @@ def read_curves(config: AblateConfig, out: Path) -> Curves:
 
 
 def summary(curves: Curves) -> str:
-    """A row for each experiment: what it needs for each milestone that one of them reaches, and its rates at the last
-    control step that all runs have got to."""
+    """A row for each experiment: what it needs for each milestone that one of them reaches, its rates at the last
+    control step that all runs have got to, and its speed."""
     runs = [curve for seeds in curves.values() for curve in seeds]
     reached = [milestone for milestone in MILESTONES if any(passage(curve, milestone) for curve in runs)]
     end = min((curve.samples[-1] for curve in runs if len(curve.samples)), default=0.0)
     head = ["M control steps to", *(milestone.label for milestone in reached)]
     head += [f"{rate}, {unit}, at {end / 1e6:.1f} M" for rate, (_, unit, _) in SHOWN_RATES.items()]
+    head.append("control steps a second")
     rows = []
     for name, seeds in curves.items():
         there = [at_end(seeds, rate, end) for rate in SHOWN_RATES]
-        rows.append([f"`{name}`", *(needed(seeds, milestone) for milestone in reached), *there])
+        rows.append([f"`{name}`", *(needed(seeds, milestone) for milestone in reached), *there, speed(seeds)])
     return markdown(head, rows)
+
+
+def speed(seeds: Sequence[Curve]) -> str:
+    """Control steps a second, median over the points of all ``seeds``: pauses do not count."""
+    rates = [np.diff(curve.samples) / (60.0 * np.diff(curve.minutes)) for curve in seeds if len(curve.samples) > 1]
+    return f"{np.median(np.concatenate(rates)):,.0f}" if rates else "-"
 
 
 def at_end(seeds: Sequence[Curve], rate: str, end: float) -> str:

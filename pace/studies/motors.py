@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from mujoco.batch import Batch
 
-from pace.config import ConfigError, load_train_config
+from pace.config import ConfigError, RobotConfig, load_train_config
 from pace.rl.env import TableTennisEnv
 from pace.rl.evaluation import ServeRecorder, play, summarise
 from pace.rl.loading import TaskPolicy, load_policy
@@ -36,31 +36,41 @@ class MotorRecorder(ServeRecorder):
     """What becomes of the serves, and how the motors are used: counts of instants, by joint.
 
     Attributes: ``instants``; ``fast`` (21,): speed over the motor's greatest; ``over`` (21,): torque over the line of
-    its world (in the last physics step of a control step, like ``joint_torque``); ``fastest`` (21,): largest speed, of
-    the motor's greatest.
+    its world (in the last physics step of a control step, like ``joint_torque``); ``held`` (21,): torque at what line
+    and effort allow, or over it; ``fastest`` (21,): largest speed, of the motor's greatest; ``excess`` (21,): largest
+    torque over the line, of the effort.
     """
 
-    def __init__(self, env: TableTennisEnv, warmup_serves: int, quota: int, lines: Array) -> None:
+    def __init__(self, env: TableTennisEnv, warmup_serves: int, quota: int, robot: RobotConfig) -> None:
         super().__init__(env, warmup_serves, quota)
+        lines = motor_lines(robot)
+        if lines is None:
+            raise ConfigError("configs/robot/t1.yaml has no stall_ratio: there is no line to compare with")
         self._speed, self._stall = torch.as_tensor(lines, dtype=torch.float32)
+        self._effort = self._stall / robot.stall_ratio
         self.instants = 0
-        self.fast, self.over, self.fastest = (torch.zeros(len(JOINT_NAMES)) for _ in range(3))
+        counts = (torch.zeros(len(JOINT_NAMES)) for _ in range(5))
+        self.fast, self.over, self.held, self.fastest, self.excess = counts
 
     def observe(self) -> None:
         super().observe()
         engine = self.env.worlds.engine
         share = engine.qvel_path[:, -2, 6:] / self._speed
         torque = engine.joint_torque * share.sign()
-        stall = engine.params.effort_scale.unsqueeze(-1) * self._stall
+        scale = engine.params.effort_scale.unsqueeze(-1)
+        stall, effort = scale * self._stall, scale * self._effort
+        beyond = torque - stall * (1.0 - share.abs())
         self.instants += self.env.num_worlds
         self.fast += (share.abs() > 1.0).sum(0)
-        self.over += (torque > stall * (1.0 - share.abs()) + SLACK * stall).sum(0)
+        self.over += (beyond > SLACK * stall).sum(0)
+        self.held += ((beyond > -SLACK * stall) | (torque.abs() > (1.0 - SLACK) * effort)).sum(0)
         torch.maximum(self.fastest, share.abs().amax(0), out=self.fastest)
+        torch.maximum(self.excess, (beyond / effort).amax(0), out=self.excess)
 
 
 @dataclass(frozen=True)
 class Use:
-    """Serves of a policy and use of its motors; arrays (21,): shares of time, and of the greatest speed."""
+    """Serves of a policy and use of its motors; arrays (21,): three shares of time, then of greatest speed and effort."""
 
     policy: str
     case: str
@@ -69,23 +79,22 @@ class Use:
     serves: int
     fast: Array
     over: Array
+    held: Array
     fastest: Array
+    excess: Array
 
 
 def use(policy: TaskPolicy, case: str, worlds: int, serves: int) -> Use:
     """Play ``serves`` mixed serves of the saved task, counted after each world's first, 2 ms a physics step."""
     env = policy.make_env(worlds, "cpu", SEED, [*ENDLESS, *CASES[case]])
-    lines = motor_lines(load_train_config().robot)
-    if lines is None:
-        raise ConfigError("configs/robot/t1.yaml has no stall_ratio: there is no line to compare with")
-    recorder = MotorRecorder(env, 1, math.ceil(serves / worlds), lines)
+    recorder = MotorRecorder(env, 1, math.ceil(serves / worlds), load_train_config().robot)
     play(env, policy, recorder)
     table = env.config.ball.table
     clear = table.height + table.net_height + env.config.ball.radius
     row = summarise("mixed", recorder.records[:-1], (0.0, 0.0), clear)
-    shares = [(count / recorder.instants).double().numpy() for count in (recorder.fast, recorder.over)]
-    fastest = recorder.fastest.double().numpy()
-    return Use(policy.source, case, row["hit"], row["success"], row["serves"], shares[0], shares[1], fastest)
+    shares = (count / recorder.instants for count in (recorder.fast, recorder.over, recorder.held))
+    arrays = [array.double().numpy() for array in (*shares, recorder.fastest, recorder.excess)]
+    return Use(policy.source, case, row["hit"], row["success"], row["serves"], *arrays)
 
 
 def uses(runs: Sequence[Path], worlds: int, serves: int) -> list[Use]:
@@ -100,15 +109,16 @@ def uses(runs: Sequence[Path], worlds: int, serves: int) -> list[Use]:
 
 
 def table(found: Sequence[Use]) -> str:
-    """One column a play: its serves, then for each group of motors time beyond speed and line, and the fastest."""
+    """One column a play: its serves, then for each group of motors the time (%) beyond its speed, beyond its line and at
+    what it can give, the largest speed, and the largest torque over the line."""
     header = ["", *(f"{Path(use.policy).name}, {use.case}" for use in found)]
     rows = [[f"hit, success (%) of {found[0].serves} serves"]]
     rows[0] += [f"{100 * use.hit:.1f}, {100 * use.success:.1f}" for use in found]
     for group in GROUPS:
         columns = [i for i, name in enumerate(JOINT_NAMES) if group in name]
         cells = [
-            f"{100 * use.fast[columns].mean():.2f}, {100 * use.over[columns].mean():.2f}, "
-            f"{use.fastest[columns].max():.2f}"
+            ", ".join(f"{100 * share[columns].mean():.2f}" for share in (use.fast, use.over, use.held))
+            + f", {use.fastest[columns].max():.2f}, {use.excess[columns].max():.2f}"
             for use in found
         ]
         rows.append([group.replace("_", " ").lower(), *cells])

@@ -103,6 +103,7 @@ def test_the_table_has_what_was_reached_and_rates_where_all_runs_have_been() -> 
     assert quick.split(" | ")[columns.index("hits 50 %")] == "6.7 (5.0 to 8.4)"
     assert quick.split(" | ")[columns.index("hits, %, at 5.0 M")] == "40.0 (30.0 to 50.0)"
     assert slow.split(" | ")[columns.index("hits, %, at 5.0 M")] == "10.0"
+    assert quick.split(" | ")[-1].strip(" |") == "16,667"  # a million a minute
 
 
 def test_seeds_are_compared_where_all_of_them_have_been() -> None:
