@@ -20,7 +20,7 @@ from pace.rl.milestones import MILESTONES, Curve, markdown, passage, passage_tex
 HERE = Path(__file__).resolve().parent
 FOLDER, FIGURE = HERE / "recipe", HERE / "figures" / "recipe.png"
 DASHES = ("-", "--", ":")
-TICKS = (0.5, 1, 2, 3, 5, 7, 10, 15, 20)  # millions of control steps
+TICKS = (0.5, 1, 2, 3, 5, 7, 10, 15, 20, 30, 40, 60)  # millions of control steps
 HEAD = ("experiment", "seed", "what changed", "M steps", *(milestone.label for milestone in MILESTONES))
 
 

@@ -70,7 +70,7 @@ class MotorRecorder(ServeRecorder):
 
 @dataclass(frozen=True)
 class Use:
-    """Serves of a policy and use of its motors; arrays (21,): three shares of time, then of greatest speed and effort."""
+    """Serves of a policy and use of its motors; arrays (21,): three shares of time, then of greatest speed, effort."""
 
     policy: str
     case: str
@@ -109,8 +109,8 @@ def uses(runs: Sequence[Path], worlds: int, serves: int) -> list[Use]:
 
 
 def table(found: Sequence[Use]) -> str:
-    """One column a play: its serves, then for each group of motors the time (%) beyond its speed, beyond its line and at
-    what it can give, the largest speed, and the largest torque over the line."""
+    """One column a play: its serves, then for each group of motors the time (%) beyond its speed, beyond its line and
+    at what it can give, the largest speed, and the largest torque over the line."""
     header = ["", *(f"{Path(use.policy).name}, {use.case}" for use in found)]
     rows = [[f"hit, success (%) of {found[0].serves} serves"]]
     rows[0] += [f"{100 * use.hit:.1f}, {100 * use.success:.1f}" for use in found]

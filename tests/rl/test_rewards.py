@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 import torch
-
 from torch import Tensor
 
 from pace.config import ConfigError, RewardConfig, RewardTerm, load_train_config
@@ -183,7 +182,7 @@ def test_return_velocity() -> None:
 
 
 def swung(arriving: Tensor, point: Tensor, speed: Tensor, normal: Tensor, params: BallParams) -> Tensor:
-    """Velocity of a ball that meets at ``point`` a paddle which moves along its normal: the simulation's own rebound."""
+    """Velocity of a ball that met a paddle at ``point`` which moves along its normal: the simulation's own rebound."""
     table, dt = config().ball.table, 0.02
     sim = BallSim(1, CPU, params, table, dt, 1, 0.004)
     fall = torch.tensor([0.0, 0.0, GRAVITY]) * 0.5 * dt
@@ -191,7 +190,9 @@ def swung(arriving: Tensor, point: Tensor, speed: Tensor, normal: Tensor, params
     gap = 0.02 + table.paddle_half_thickness
     path = torch.zeros(1, 2, 12)
     for knot, time in enumerate((-0.5 * dt, 0.5 * dt)):
-        path[0, knot] = torch.cat([point - gap * normal + time * speed * normal, normal, speed * normal, torch.zeros(3)])
+        path[0, knot] = torch.cat(
+            [point - gap * normal + time * speed * normal, normal, speed * normal, torch.zeros(3)]
+        )
     sim.fly(path)
     assert sim.events.paddle_hit[0] == 1
     return sim.events.hit_velocity_out[0]

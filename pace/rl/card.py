@@ -1,0 +1,73 @@
+"""The card of a kept policy: what it is, how it was trained, how well it plays and how to play it, as Markdown."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pace.rl.evaluation_report import markdown_table
+
+CARD, SAVED = "README.md", "checkpoint.json"
+EVALUATION, SWEEP, VERSIONS = "evaluation.json", "sweep.json", "versions.json"
+GROUPS = ("robot", "ball", "serve", "randomization", "sensing", "observation", "reward", "predictor", "algo")
+#: Of the machine that played, not of what was played.
+MACHINE = ("engine.threads=", "engine.graph=", "engine.physics_dt=")
+
+
+def card(folder: Path, notes: str = "") -> str:
+    """The card of the policy in ``folder``, from the files that lie there; ``notes`` stand below its first table."""
+    saved = json.loads((folder / SAVED).read_text())
+    parts = [f"# {folder.name}", _facts(saved, _read(folder / VERSIONS)), notes.strip()]
+    evaluation, sweep = _read(folder / EVALUATION), _read(folder / SWEEP)
+    parts += [_evaluation(folder, evaluation)] if evaluation.get("rows") else []
+    parts += [_sweep(sweep)] if sweep.get("cells") else []
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _read(file: Path) -> dict[str, Any]:
+    return json.loads(file.read_text()) if file.is_file() else {}
+
+
+def _facts(saved: Mapping[str, Any], versions: Mapping[str, Any]) -> str:
+    counters, config = saved["counters"], saved["config"]
+    command = versions.get("command", [])[1:]
+    rows = [
+        ("task", ", ".join(f"`{group}={config[group]['name']}`" for group in GROUPS if "name" in config[group])),
+        ("seed", str(config["seed"])),
+        ("control steps", f"{counters['samples'] / 1e6:.1f} million"),
+        ("time", f"{counters['wall_s'] / 3600:.1f} h, {config['num_worlds']:,} worlds"),
+        ("last command", f"`python -m pace.rl.train {' '.join(command)}`" if command else ""),
+        ("versions", ", ".join(f"{name} {number}" for name, number in versions.get("packages", {}).items() if number)),
+    ]
+    return markdown_table(("", ""), [row for row in rows if row[1]]).replace("---:", "---")
+
+
+def _evaluation(folder: Path, found: Mapping[str, Any]) -> str:
+    overrides = [text for text in found["overrides"] if not text.startswith(MACHINE)]
+    fixed = [f"{key}={found[key]}" for key in ("physics_dt", "num_worlds", "warmup_serves", "seed")]
+    serves = f"serves={min(row['serves'] for row in found['rows'])}"
+    command = " ".join(["python -m pace.rl.evaluate", f"pretrained/{folder.name}", *fixed, serves, *overrides])
+    table = markdown_table(
+        ("serves", "number", "hit %", "success %", "falls per 1,000"), [_row(row) for row in found["rows"]]
+    )
+    return f"## How well it plays\n\n`{command}`\n\n{table}"
+
+
+def _sweep(found: Mapping[str, Any]) -> str:
+    rows = [
+        [f"{cell['kind'].replace('_', ' ')} {cell['value']}".strip(), *_row(row)]
+        for cell in found["cells"]
+        for row in cell["rows"]
+    ]
+    head = ("change", "serves", "number", "hit %", "success %", "falls per 1,000")
+    return f"## What it survives\n\n{markdown_table(head, rows)}"
+
+
+def _row(row: Mapping[str, Any]) -> Sequence[str]:
+    hit, success = (
+        f"{100 * row[name]:.1f} ({100 * row[f'{name}_low']:.1f} to {100 * row[f'{name}_high']:.1f})"
+        for name in ("hit", "success")
+    )
+    return row["serve"].replace("_", "-"), f"{row['serves']:,}", hit, success, f"{row['falls_per_1000']:.1f}"
