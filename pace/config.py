@@ -463,6 +463,7 @@ class AlgoConfig:
             _require(all(point.value > 0 for point in getattr(self, name)), f"algo.{name} must be positive")
 
 
+COUNTED_FRAMES = 5  # the last positions that ``predictor.features=counted`` sees
 FRAME_DT = 0.02  # s, between the positions that ``predictor.features=flight`` fits
 
 
@@ -479,11 +480,14 @@ class PredictorConfig:
     train_updates: int  # frozen afterwards; 0 trains it to the end
     outputs: list[str]  # of apex (3), target (3), target_time (1)
     enabled: bool  # off: the actor sees zeros instead (ablation)
-    features: str = "steps"  # steps (positions alone), flight (a fit of the whole flight, which needs many frames)
+    features: str = "steps"  # steps (positions alone), counted (the last five, and how many there were before them), or
+    # flight (a fit of the whole flight); the latter two need many frames
 
     def __post_init__(self) -> None:
-        known = ("steps", "flight")
-        _require(self.features in known, f"predictor.features must be steps or flight, not {self.features!r}")
+        known = ("steps", "counted", "flight")
+        _require(self.features in known, f"predictor.features must be steps, counted or flight, not {self.features!r}")
+        enough = self.features != "counted" or self.frames > COUNTED_FRAMES
+        _require(enough, f"predictor.features=counted needs more than {COUNTED_FRAMES} frames, got {self.frames}")
         _require(self.learning_rate > 0, "predictor.learning_rate must be positive")
         for name in ("batch_size", "batches_per_update"):
             _require(getattr(self, name) >= 1, f"predictor.{name} must be at least 1, got {getattr(self, name)}")

@@ -1,7 +1,8 @@
 """The learned predictor: from the last sensed ball positions to the apex, the paddle's target and the time to it.
 
-``features: steps`` sees positions and nothing else (paper); ``features: flight`` fits two parabolas to them first
-(:mod:`pace.predictor.filter`), for windows that hold the whole flight, and learns what these get wrong.
+``features: steps`` sees positions and nothing else (paper). For windows that hold the whole flight, ``counted`` sees
+the last five of them and how many there were, and ``flight`` fits two parabolas to all (:mod:`pace.predictor.filter`)
+and learns what these get wrong.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from itertools import accumulate, pairwise
 import torch
 from torch import Tensor, nn
 
-from pace.config import ConfigError, PredictorConfig
+from pace.config import COUNTED_FRAMES, ConfigError, PredictorConfig
 from pace.predictor.filter import FALL, RISE, FlightFilter
 
 OUTPUT_SIZES = {"apex": 3, "target": 3, "target_time": 1}
@@ -21,6 +22,7 @@ OUTPUT_SIZES = {"apex": 3, "target": 3, "target_time": 1}
 # Between two frames (20 ms) it moves by about (-0.11, 0, 0) m, and serves differ in that by a few centimetres.
 POSITION_CENTRE, POSITION_SCALE = (0.0, 0.0, 1.0), (1.0, 0.4, 0.25)
 STEP_CENTRE, STEP_SCALE = (-0.11, 0.0, 0.0), (0.02, 0.02, 0.03)
+COUNT_CENTRE, COUNT_SCALE = 20.0, 10.0  # frames since the launch
 # What the fit of a flight says, likewise (m, s, m/s): times, velocities before and after the bounce, where it bounces.
 AGE_CENTRE, AGE_SCALE, FRAMES_SCALE = 0.35, 0.25, 6.0
 FALL_CENTRE, FALL_SCALE = (-5.2, -0.2, -0.5), (0.5, 0.35, 1.5)
@@ -75,7 +77,9 @@ class PredictorNetwork(nn.Module):
 
     The frames are ordered from the oldest to the newest. Inside, they become the newest position and the steps between
     frames, scaled: the same information, but the small differences that carry the velocity are as large as the rest.
-    With ``config.features`` "flight" they become a fit of the flight, and the MLP gives what its apex lacks.
+    With ``config.features`` "counted" those are the last five, and the number of frames since the launch goes with
+    them: the window holds its first position over and over where the flight was shorter.
+    With "flight" they become a fit of the flight, and the MLP gives what its apex lacks.
     Outputs stand in the order of ``config.outputs``; ``slices[name]`` finds them.
     """
 
@@ -101,7 +105,9 @@ class PredictorNetwork(nn.Module):
         centre = [value for name in self.outputs for value in OUTPUT_CENTRES[name]]
         scale = [value for name in self.outputs for value in OUTPUT_SCALES[name]]
         self._scaling("output", centre, scale)
-        sizes = [self.flight.size if self.flight else self.input_size, *config.hidden]
+        self.counted = config.features == "counted"
+        seen = 3 * COUNTED_FRAMES + 1 if self.counted else self.input_size
+        sizes = [self.flight.size if self.flight else seen, *config.hidden]
         hidden = [part for a, b in pairwise(sizes) for part in (nn.Linear(a, b), nn.ReLU())]
         self.layers = nn.Sequential(*hidden, nn.Linear(sizes[-1], self.output_size))
 
@@ -112,8 +118,16 @@ class PredictorNetwork(nn.Module):
         self.register_buffer(f"{name}_scale", torch.tensor(scale), persistent=False)
 
     def features(self, positions: Tensor) -> Tensor:
-        """(N, 3 frames) ball positions -> (N, 3 frames) scaled newest position and steps."""
+        """(N, 3 frames) ball positions -> scaled newest position and steps (N, 3 frames), or those of the last five and
+        the count of frames (N, 16)."""
         frames = positions.unflatten(1, (self.frames, 3))
+        if self.counted:
+            moved = (frames[:, 1:] != frames[:, :-1]).any(2).sum(1, keepdim=True)
+            count = (moved - COUNT_CENTRE) / COUNT_SCALE
+            return torch.cat([self._steps(frames[:, -COUNTED_FRAMES:]), count], dim=1)
+        return self._steps(frames)
+
+    def _steps(self, frames: Tensor) -> Tensor:
         newest = (frames[:, -1] - self.position_centre) / self.position_scale
         steps = (frames[:, 1:] - frames[:, :-1] - self.step_centre) / self.step_scale
         return torch.cat([newest, steps.flatten(1)], dim=1)

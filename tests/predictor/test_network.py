@@ -52,6 +52,22 @@ def test_features_are_the_newest_position_and_the_steps_between_frames() -> None
     torch.testing.assert_close(features[12:], torch.tensor([0.5, 20.0, 0.25 / 0.03]))
 
 
+def test_counted_features_are_five_positions_and_the_number_of_the_frame() -> None:
+    five = PredictorNetwork(predictor_config())
+    counted = PredictorNetwork(load_train_config(["predictor=counted"]).predictor)
+    flight = torch.cumsum(torch.rand(3, 30, 3, generator=torch.Generator().manual_seed(1)), dim=1)
+    padding = flight[:, :1].expand(3, 15, 3)
+    early = torch.cat([flight[:, :1].expand(3, 42, 3), flight[:, :3]], dim=1)
+    features = counted.features(torch.cat([padding, flight], dim=1).flatten(1))
+    torch.testing.assert_close(features[:, :15], five.features(flight[:, -5:].flatten(1)))
+    assert features.shape == (3, 16)
+    torch.testing.assert_close(features[:, 15], torch.full((3,), (29 - 20.0) / 10.0))
+    torch.testing.assert_close(counted.features(early.flatten(1))[:, 15], torch.full((3,), (2 - 20.0) / 10.0))
+    assert counted(early.flatten(1)).shape == (3, 7)
+    with pytest.raises(ConfigError, match="counted needs more than 5 frames, got 5"):
+        load_train_config(["predictor.features=counted"])
+
+
 def test_features_of_real_serves_are_of_order_one() -> None:
     network = PredictorNetwork(predictor_config())
     features = network.features(serves(2000)[0])
