@@ -13,6 +13,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock, Timeout
 from omegaconf import OmegaConf
 from torchrl.record.loggers.tensorboard import TensorboardLogger
 
@@ -20,6 +21,7 @@ from pace.config import ConfigError
 from pace.rl.checkpoint import list_checkpoints
 from pace.rl.milestones import read_metrics
 
+LOCK = ".lock"
 CONFIG, VERSIONS, METRICS, CURVE = "config.yaml", "versions.json", "metrics.csv", "learning_curve.png"
 PACKAGES = ("torch", "torchrl", "tensordict", "mujoco", "mujoco-warp", "warp-lang", "numpy", "hydra-core")
 LEADING = (
@@ -72,9 +74,11 @@ def git_state(folder: Path) -> dict[str, Any] | None:
 
 
 class RunFolder:
-    """Files of one run. Rows that a crashed run logged after ``first_update``, its last checkpoint, are dropped.
+    """Files of one run, of which one process at a time is the owner. Rows that a crashed run logged after
+    ``first_update``, its last checkpoint, are dropped.
 
-    Errors: :class:`ConfigError` for a folder that cannot be made, or that holds a checkpoint later than that.
+    Errors: :class:`ConfigError` for a folder that cannot be made, that another process owns, or that holds a checkpoint
+    later than that.
     """
 
     def __init__(self, path: str | Path, config: dict[str, Any], tensorboard: bool, first_update: int = 0) -> None:
@@ -92,6 +96,13 @@ class RunFolder:
             self.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise ConfigError(f"run_dir {self.path} cannot be made: {error.strerror}") from error
+        self._lock = FileLock(self.path / LOCK)  # the system lets go of it with the process, however that ends
+        try:
+            self._lock.acquire(timeout=0)
+        except Timeout as error:
+            raise ConfigError(
+                f"{self.path} is in use by another process: end that first, or give another run_dir"
+            ) from error
         last = max((int(folder.name.removeprefix("update_")) for folder in list_checkpoints(self.path)), default=0)
         if last > first_update:
             raise ConfigError(
@@ -132,8 +143,9 @@ class RunFolder:
                     self._board.log_scalar(name, value, step=int(row["samples"]))
 
     def close(self) -> None:
-        """Flush and close the logs."""
+        """Flush and close the logs, and let go of the folder."""
         self._file.close()
+        self._lock.release()
         if self._board is not None:
             self._board.experiment.close()
 

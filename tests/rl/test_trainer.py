@@ -264,3 +264,14 @@ def test_rates_of_the_statistics() -> None:
     assert (row["hit_rate"], row["success_rate"], row["net"]) == (0.5, 0.25, 0.125)
     assert row["fall_rate"] == pytest.approx(0.25)  # 3 falls in 600 x 0.02 s
     assert (row["mean_reward"], row["reward/hit"]) == pytest.approx((0.1, 0.05))
+
+
+def test_a_run_folder_has_one_owner(tmp_path: Path) -> None:
+    first = RunFolder(tmp_path, {}, False)
+    first.log({"update": 1.0, "samples": 4.0})
+    with pytest.raises(ConfigError, match="in use by another process: end that first, or give another run_dir"):
+        RunFolder(tmp_path, {}, False)
+    first.log({"update": 2.0, "samples": 8.0})
+    first.close()
+    assert read_metrics(tmp_path / "metrics.csv")["update"] == [1.0, 2.0]  # the second has touched nothing
+    RunFolder(tmp_path, {}, False, 2).close()
