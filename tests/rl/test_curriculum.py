@@ -40,12 +40,11 @@ def test_each_stage_changes_the_task_of_the_one_before() -> None:
 
 def test_the_campaigns_stages_are_tasks() -> None:
     tasks = stage_tasks(load_train_config(["experiment=campaign"]))
-    assert [task.reward.terms["ready_stance"].weight for task in tasks] == [0.0, *4 * [10.0]]
-    assert [task.sensing.name for task in tasks] == ["paper", "paper", *3 * ["wide"]]
-    assert [task.randomization.trunk_mass for task in tasks] == [*2 * [[-2.0, 2.0]], *3 * [[-4.0, 6.0]]]
-    assert [task.serve.serves_per_episode for task in tasks] == [5, 5, 5, 20, 20]
-    assert [task.reward.terms["return_velocity"].params["time"] for task in tasks] == [*3 * [0.5], 0.56, 0.56]
-    assert [task.engine.physics_dt for task in tasks] == [*4 * [0.01], 0.005]
+    assert [task.reward.terms["ready_stance"].weight for task in tasks] == [0.0, *3 * [10.0]]
+    assert [task.sensing.name for task in tasks] == ["paper", "paper", *2 * ["wide"]]
+    assert [task.randomization.trunk_mass for task in tasks] == [*2 * [[-2.0, 2.0]], *2 * [[-4.0, 6.0]]]
+    assert [task.serve.serves_per_episode for task in tasks] == [5, 5, 5, 20]
+    assert [task.reward.terms["return_velocity"].params["time"] for task in tasks] == [*3 * [0.5], 0.56]
 
 
 def test_worlds_are_made_when_a_stage_begins() -> None:
