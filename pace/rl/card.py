@@ -7,9 +7,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from pace.rl.checkpoint import load_checkpoint
 from pace.rl.evaluation_report import markdown_table
+from pace.rl.loading import saved_config
 
-CARD, SAVED = "README.md", "checkpoint.json"
+CARD = "README.md"
 EVALUATION, SWEEP, VERSIONS = "evaluation.json", "sweep.json", "versions.json"
 GROUPS = ("robot", "ball", "serve", "randomization", "sensing", "observation", "reward", "predictor", "algo")
 #: Of the machine that played, not of what was played.
@@ -18,8 +20,7 @@ MACHINE = ("engine.threads=", "engine.graph=", "engine.physics_dt=")
 
 def card(folder: Path, notes: str = "") -> str:
     """The card of the policy in ``folder``, from the files that lie there; ``notes`` stand below its first table."""
-    saved = json.loads((folder / SAVED).read_text())
-    parts = [f"# {folder.name}", _facts(saved, _read(folder / VERSIONS)), notes.strip()]
+    parts = [f"# {folder.name}", _facts(folder, _read(folder / VERSIONS)), notes.strip()]
     evaluation, sweep = _read(folder / EVALUATION), _read(folder / SWEEP)
     parts += [_evaluation(folder, evaluation)] if evaluation.get("rows") else []
     parts += [_sweep(sweep)] if sweep.get("cells") else []
@@ -30,14 +31,17 @@ def _read(file: Path) -> dict[str, Any]:
     return json.loads(file.read_text()) if file.is_file() else {}
 
 
-def _facts(saved: Mapping[str, Any], versions: Mapping[str, Any]) -> str:
-    counters, config = saved["counters"], saved["config"]
+def _facts(folder: Path, versions: Mapping[str, Any]) -> str:
+    checkpoint = load_checkpoint(folder, weights_only=True)
+    counters, config = checkpoint.counters, saved_config(checkpoint)
     command = versions.get("command", [])[1:]
+    named = [(group, getattr(config, group).name) for group in GROUPS]
     rows = [
-        ("task", ", ".join(f"`{group}={config[group]['name']}`" for group in GROUPS if "name" in config[group])),
-        ("seed", str(config["seed"])),
+        ("task, at the end", ", ".join(f"`{group}={name}`" for group, name in named)),
+        ("curriculum", ", ".join(f"{stage.samples / 1e6:g} M: {' '.join(stage.task)}" for stage in config.curriculum)),
+        ("seed", str(config.seed)),
         ("control steps", f"{counters['samples'] / 1e6:.1f} million"),
-        ("time", f"{counters['wall_s'] / 3600:.1f} h, {config['num_worlds']:,} worlds"),
+        ("time", f"{counters['wall_s'] / 3600:.1f} h, {config.num_worlds:,} worlds"),
         ("last command", f"`python -m pace.rl.train {' '.join(command)}`" if command else ""),
         ("versions", ", ".join(f"{name} {number}" for name, number in versions.get("packages", {}).items() if number)),
     ]
