@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import lru_cache
+from typing import Any
 
 import torch
 import warp as wp
@@ -320,29 +321,26 @@ class BallSim:
         self, position: Tensor, velocity: Tensor, spin: Tensor, intercept_x: float
     ) -> Callable[[Tensor], None]:
         """:meth:`forecast` of a mask, always from these tensors: it reads them where they lie, which saves copies."""
-        start = [share(self._ask_mask), share(position), share(velocity), share(spin)]
+        start = [share(position), share(velocity), share(spin)]
         result = share_all(ForecastArrays, vars(self.forecast_result))
         inputs = [*start, wp.from_torch(self._param_matrix), self._scene, result, intercept_x, self._ball_dt]
-        launch = record(forecast_flight, self.num_worlds, inputs, self.device)
+        return self._of_a_mask(forecast_flight, inputs)
 
-        def ahead(mask: Tensor) -> None:
+    def _of_a_mask(self, kernel: wp.Kernel, inputs: list[Any]) -> Callable[[Tensor], None]:
+        """A function of a mask (N,) bool that launches ``kernel`` with that mask and ``inputs``."""
+        launch = record(kernel, self.num_worlds, [share(self._ask_mask), *inputs], self.device)
+
+        def call(mask: Tensor) -> None:
             self._ask_mask.copy_(mask)
             launch()
 
-        return ahead
+        return call
 
     def skipper(self, duration: Tensor) -> Callable[[Tensor], None]:
         """A function of a mask (N,) bool that moves those balls on by ``duration`` (N,) s of their flight at once.
 
         No further than to where they are about to touch something; nothing is hit and nothing is noted.
         """
-        mask = torch.zeros(self.num_worlds, dtype=torch.bool, device=self.device)
-        state = [share(mask), share(duration), share(self.position), share(self.velocity), share(self.spin)]
+        state = [share(duration), share(self.position), share(self.velocity), share(self.spin)]
         inputs = [*state, wp.from_torch(self._param_matrix), self._scene, self._ball_dt]
-        launch = record(skip_flight, self.num_worlds, inputs, self.device)
-
-        def skip(chosen: Tensor) -> None:
-            mask.copy_(chosen)
-            launch()
-
-        return skip
+        return self._of_a_mask(skip_flight, inputs)

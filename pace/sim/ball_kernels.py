@@ -199,6 +199,16 @@ def _record_event(events: EventArrays, leg: Leg, after: Flight, body: Body, scen
 
 
 @wp.func
+def _flight_of(position: wp.array[wp.vec3], velocity: wp.array[wp.vec3], spin: wp.array[wp.vec3], world: int) -> Flight:
+    """The flight that begins with the ball of a world; its gaps are still to be found."""
+    flight = Flight()
+    flight.position = position[world]
+    flight.velocity = velocity[world]
+    flight.spin = spin[world]
+    return flight
+
+
+@wp.func
 def _segment_distance(start: wp.vec3, end: wp.vec3) -> float:
     """Smallest distance of the origin to the segment from ``start`` to ``end``."""
     way = end - start
@@ -222,10 +232,7 @@ def fly_step(
     world = wp.tid()
     _clear_events(events, world)
     body = read_body(params, world)
-    flight = Flight()
-    flight.position = position[world]
-    flight.velocity = velocity[world]
-    flight.spin = spin[world]
+    flight = _flight_of(position, velocity, spin, world)
     paddle_speed = paddle_speed_bound(scene, world)
     # A rebound turns spin into speed.
     speed = wp.length(flight.velocity) + body.radius * wp.length(flight.spin)
@@ -343,10 +350,7 @@ def forecast_flight(
         return
     _clear_forecast(forecast, world)
     body = read_body(params, world)
-    flight = Flight()
-    flight.position = position[world]
-    flight.velocity = velocity[world]
-    flight.spin = spin[world]
+    flight = _flight_of(position, velocity, spin, world)
     flight.gaps = gaps_to(STATIC_SURFACES, flight.position, 0.0, body.radius, scene, world)
     for _leg in range(_MAX_FORECAST_LEGS):
         remaining = _HORIZON - flight.clock
@@ -378,10 +382,7 @@ def skip_flight(
     if not mask[world]:
         return
     body = read_body(params, world)
-    flight = Flight()
-    flight.position = position[world]
-    flight.velocity = velocity[world]
-    flight.spin = spin[world]
+    flight = _flight_of(position, velocity, spin, world)
     flight.gaps = gaps_to(STATIC_SURFACES, flight.position, 0.0, body.radius, scene, world)
     for _leg in range(_MAX_FORECAST_LEGS):
         remaining = duration[world] - flight.clock
