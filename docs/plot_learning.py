@@ -11,7 +11,7 @@ from pathlib import Path
 
 import matplotlib
 
-from pace.rl.milestones import Curve, Milestone, markdown, passage, read_curve
+from pace.runs.metrics import Curve, Milestone, markdown, passage, read_curve
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt

@@ -11,7 +11,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from pace.config import ConfigError, config_dir
+from pace.config.base import ConfigError, config_dir
 
 EXIT_USAGE = 2
 EXIT_FAILED = 1

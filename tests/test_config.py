@@ -9,7 +9,9 @@ import pytest
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
-from pace.config import BenchConfig, ConfigError, TrainConfig, compose, config_dir, load_train_config, parse, to_dict
+from pace.config.base import ConfigError, compose, config_dir, parse, to_dict
+from pace.config.commands import BenchConfig
+from pace.config.training import TrainConfig, load_train_config
 
 SCHEMAS = {"train": TrainConfig, "bench": BenchConfig}
 

@@ -23,9 +23,10 @@ from omegaconf import DictConfig
 
 from pace.bench import physics, report, training, update
 from pace.command import run_command
-from pace.config import BenchConfig, parse
-from pace.rl.run_folder import default_run_dir, versions
-from pace.sim.engine import resolve_device
+from pace.config.base import parse
+from pace.config.commands import BenchConfig
+from pace.devices import resolve_device
+from pace.runs.run_folder import default_run_dir, versions
 
 BUSY_LOAD = 0.5  # a core; a busier machine is worth a word
 

@@ -10,10 +10,11 @@ from types import TracebackType
 import torch
 
 from pace.bench.training import BenchError
-from pace.config import BenchConfig
+from pace.config.commands import BenchConfig
+from pace.devices import threads_of
+from pace.distributed import Team
 from pace.predictor.network import PredictorNetwork
-from pace.rl.env import TableTennisEnv
-from pace.team import Team, threads_of
+from pace.task.env import TableTennisEnv
 
 FAILED = "a process of the environment's crew failed; what it said stands above"
 

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from pace.bench.environment import EnvironmentCrew, EnvironmentLoop
 from pace.bench.timing import median_seconds
-from pace.config import BenchConfig
-from pace.team import suitable_size
+from pace.config.commands import BenchConfig
+from pace.distributed import suitable_size
 
 
 class RawMujoco:

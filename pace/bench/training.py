@@ -9,8 +9,9 @@ import tempfile
 import time
 from pathlib import Path
 
-from pace.config import BenchConfig, load_train_config
-from pace.rl.run_folder import METRICS
+from pace.config.commands import BenchConfig
+from pace.config.training import load_train_config
+from pace.runs.run_folder import METRICS
 
 POLL_SECONDS = 0.1  # of the memory's high-water mark, which never falls while a process runs
 WARM_UP_ROWS = 2  # updates that do not count: compilation, allocation

@@ -12,8 +12,9 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from pace.bench.timing import median_seconds
-from pace.config import AlgoConfig, BenchConfig, BenchOptions, load_train_config
-from pace.rl.policy import Agent, compute_dtype
+from pace.config.commands import BenchConfig, BenchOptions
+from pace.config.training import AlgoConfig, load_train_config
+from pace.rl.agent import Agent, compute_dtype
 from pace.rl.ppo import PPO
 from pace.rl.rollout import Rollout
 

@@ -2,6 +2,6 @@
 
 from pace.predictor.forecast import forecast_flight
 from pace.predictor.network import PredictorNetwork
-from pace.sim.ball import Forecast
+from pace.sim.ball.ball import Forecast
 
 __all__ = ["Forecast", "PredictorNetwork", "forecast_flight"]

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from pace.config import FRAME_DT as FRAME
+from pace.config.task import FRAME_DT as FRAME
 
 UNIT = 0.4  # s; times in the fits are in this unit, so that the sums are of order one
 NOISE = 0.004  # m, standard deviation of a sensed position (uniform +-7 mm)

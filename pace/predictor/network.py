@@ -12,7 +12,8 @@ from itertools import accumulate, pairwise
 import torch
 from torch import Tensor, nn
 
-from pace.config import COUNTED_FRAMES, ConfigError, PredictorConfig
+from pace.config.base import ConfigError
+from pace.config.task import COUNTED_FRAMES, PredictorConfig
 from pace.predictor.filter import FALL, RISE, FlightFilter
 
 OUTPUT_SIZES = {"apex": 3, "target": 3, "target_time": 1}

@@ -8,10 +8,10 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from pace.config import PredictorConfig
+from pace.config.task import PredictorConfig
+from pace.distributed import Team
 from pace.predictor.network import PredictorNetwork
-from pace.predictor.optimiser import load_optimiser_state, optimiser_state
-from pace.team import Team
+from pace.runs.optimiser import load_optimiser_state, optimiser_state
 
 TIME_BINS = (0.0, 0.1, 0.2, 0.3, 0.4)  # s before the apex; the first and the last bin are open
 BIN_NAMES = ("after_apex", "0_0.1s", "0.1_0.2s", "0.2_0.3s", "0.3_0.4s", "over_0.4s")

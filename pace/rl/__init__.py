@@ -1,24 +1,24 @@
-"""Table tennis as a learning task: environment, rewards, observations, PPO and the commands."""
+"""How a policy learns: networks, rollouts, PPO, the training loop, and loading what was trained.
+
+Here belongs the learner; the task it learns is in ``task``, how well it plays is measured in ``evaluation``. Imports
+``task``, ``predictor``, ``runs`` and the rooms below. ``python -m pace.rl.train`` trains.
+"""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:
-    from pace.rl.env import TableTennisEnv, make_env
-    from pace.rl.loading import load_policy
+import pace
 
-__all__ = ["TableTennisEnv", "load_policy", "make_env"]
+if TYPE_CHECKING:
+    from pace.rl.policies import load_policy
+    from pace.task.env import make_env
+
+__all__ = ["load_policy", "make_env"]
 
 
 def __getattr__(name: str) -> Any:
-    """Import on first use, so that ``import pace.rl`` stays light."""
-    if name == "load_policy":
-        from pace.rl.loading import load_policy
-
-        return load_policy
+    """The names of :mod:`pace` that users found here first."""
     if name in __all__:
-        from pace.rl import env
-
-        return getattr(env, name)
+        return getattr(pace, name)
     raise AttributeError(f"module 'pace.rl' has no attribute {name!r}")

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
-from pace.config import TrainConfig
-from pace.rl.loading import stage_tasks
+from pace.config.overrides import stage_tasks
+from pace.config.training import TrainConfig
 
 Worlds = TypeVar("Worlds")
 

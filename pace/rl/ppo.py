@@ -10,11 +10,12 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives import ClipPPOLoss, KLAdaptiveLR
 
-from pace.config import AlgoConfig, ConfigError
-from pace.predictor.optimiser import load_optimiser_state, optimiser_state
-from pace.rl.policy import Agent, scheduled
+from pace.config.base import ConfigError
+from pace.config.training import AlgoConfig
+from pace.distributed import Team
+from pace.rl.agent import Agent, scheduled
 from pace.rl.rollout import Rollout, RolloutError
-from pace.team import Team
+from pace.runs.optimiser import load_optimiser_state, optimiser_state
 
 LOSS_METRICS = (
     "loss_objective",

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
-from pace.rl.policy import Agent
+from pace.rl.agent import Agent
 
 CRITIC_ROWS = 8192  # rows of one critic pass after the rollout: bounds the memory of its activations
 

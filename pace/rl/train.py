@@ -24,23 +24,20 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from pace.command import run_command
-from pace.config import ConfigError, TrainConfig, parse, to_dict
+from pace.config.base import ConfigError, parse, to_dict
+from pace.config.training import RESUME_KEYS, TrainConfig
+from pace.devices import resolve_device, threads_of
+from pace.distributed import Team, TeamError, own_device, suitable_size, team_of
 from pace.predictor.network import PredictorNetwork
-from pace.rl.checkpoint import Checkpoint, CheckpointError, load_checkpoint
 from pace.rl.curriculum import Curriculum
-from pace.rl.progress import rate_texts
 from pace.rl.rollout import RolloutError
-from pace.rl.run_folder import CURVE, METRICS, RunFolder, default_run_dir
 from pace.rl.trainer import Summary, Trainer, begins_anew, played_on
-from pace.sim.engine import resolve_device
-from pace.team import Team, TeamError, own_device, suitable_size, team_of, threads_of
+from pace.runs.checkpoint import Checkpoint, CheckpointError, load_checkpoint
+from pace.runs.progress import rate_texts
+from pace.runs.run_folder import CURVE, METRICS, RunFolder, default_run_dir
 
 if TYPE_CHECKING:
-    from pace.rl.env import TableTennisEnv
-
-# What a resumed run may change; everything else is as it was saved, or the run would not go on where it stopped.
-# Other processes play other worlds, which begin anew.
-RESUME_KEYS = ("resume", "samples", "minutes", "checkpoint_minutes", "tensorboard", "progress", "device", "processes")
+    from pace.task.env import TableTennisEnv
 SEEDS_APART = 1_000_003  # between the stages of a curriculum: further than seeds of runs lie apart
 
 
@@ -123,7 +120,7 @@ def make_worlds(
 
     ``again``: another number makes other draws, for worlds that begin anew in a run.
     """
-    from pace.rl.env import TableTennisEnv
+    from pace.task.env import TableTennisEnv
 
     threads = task.engine.threads or threads_of(team.size)
     task = replace(task, engine=replace(task.engine, threads=threads))
@@ -141,7 +138,7 @@ def first_weights(config: TrainConfig) -> Checkpoint | None:
         return start
     given = load_checkpoint(config.predictor_from, weights_only=True)
     if "predictor" not in given.weights:
-        raise CheckpointError(f"{given.path} has no predictor: give predictor_from a run of pace.predictor.train")
+        raise CheckpointError(f"{given.path} has no predictor: give predictor_from a run of pace.predictor.__main__")
     if start is None:
         return replace(given, weights={"predictor": given.weights["predictor"]})
     return replace(start, weights=start.weights | {"predictor": given.weights["predictor"]})

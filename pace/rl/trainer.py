@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import math
-import signal
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -15,10 +11,16 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor, nn
 
-from pace.config import ConfigError, TrainConfig, to_dict
+from pace.config.base import ConfigError, to_dict
+from pace.config.training import TrainConfig
+from pace.distributed import Team
 from pace.predictor.network import PredictorNetwork
 from pace.predictor.regression import PredictorSource, PredictorTrainer
-from pace.rl.checkpoint import (
+from pace.rl.agent import Agent
+from pace.rl.curriculum import Curriculum
+from pace.rl.ppo import PPO
+from pace.rl.rollout import Rollout, RolloutError, VectorTask
+from pace.runs.checkpoint import (
     FOLDER,
     Checkpoint,
     CheckpointError,
@@ -27,13 +29,9 @@ from pace.rl.checkpoint import (
     prune_checkpoints,
     save_checkpoint,
 )
-from pace.rl.curriculum import Curriculum
-from pace.rl.policy import Agent
-from pace.rl.ppo import PPO
-from pace.rl.progress import Progress
-from pace.rl.rollout import Rollout, RolloutError, VectorTask
-from pace.rl.run_folder import RunFolder, plot_learning_curve
-from pace.team import Team
+from pace.runs.interrupt import StopRequest
+from pace.runs.progress import Progress
+from pace.runs.run_folder import RunFolder, plot_learning_curve
 
 CHECKPOINTS_KEPT = 4
 LAST_GOOD = "last_good"  # folder in the run: the weights before an update that failed
@@ -73,36 +71,6 @@ class Summary:
     checkpoint: Path
     curve: Path | None
     rates: dict[str, float]
-
-
-class StopRequest:
-    """Set by the first Ctrl-C or SIGTERM; the update that runs is finished, saved, and the run ends."""
-
-    def __init__(self) -> None:
-        self.name: str | None = None
-
-    @contextmanager
-    def listening(self) -> Iterator[None]:
-        """Take the two signals over while the block runs; a second one acts as it would without this class."""
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
-        before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-
-        def give_back() -> None:
-            for number, handler in before.items():
-                signal.signal(number, handler)
-
-        def on_signal(number: int, _frame: object) -> None:
-            self.name = signal.Signals(number).name
-            give_back()
-
-        for number in before:
-            signal.signal(number, on_signal)
-        try:
-            yield
-        finally:
-            give_back()
 
 
 class Trainer:

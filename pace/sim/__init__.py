@@ -1,8 +1,30 @@
-"""Physics of N table-tennis worlds: the robot, the ball and what the robot senses. Knows nothing of learning."""
+"""Physics of N table-tennis worlds: the robot, the ball and what the robot senses. Knows nothing of learning.
 
-import warp as wp
+Here belongs what is true of the world, and how sensors see it; not what is asked of the robot. Imports ``arrays`` and
+the rooms below.
+"""
 
-# Warp compiles each module once per setting, so both must stand before the first kernel is defined.
-wp.config.enable_backward = False  # nothing here is differentiated; adjoint code doubles the compilation
-wp.config.log_level = wp.LOG_WARNING  # no banner and no line per module that is loaded
-wp.init()  # wp.device_from_torch does not do it by itself
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pace.arrays  # noqa: F401  sets Warp up before the first kernel is defined
+
+if TYPE_CHECKING:
+    from pace.sim.engine.factory import make_engine
+    from pace.sim.worlds import Worlds
+
+__all__ = ["Worlds", "make_engine"]
+
+
+def __getattr__(name: str) -> Any:
+    """Import on first use: the physics takes a while to load."""
+    if name == "Worlds":
+        from pace.sim.worlds import Worlds
+
+        return Worlds
+    if name == "make_engine":
+        from pace.sim.engine.factory import make_engine
+
+        return make_engine
+    raise AttributeError(f"module 'pace.sim' has no attribute {name!r}")

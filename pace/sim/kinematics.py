@@ -13,8 +13,8 @@ import warp as wp
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pace.arrays.share import record
 from pace.sim.robot import FEET
-from pace.sim.sharing import record
 
 #: The tips, in the order of the chains: sites of the model.
 TIPS = ("paddle", *FEET, "head")
@@ -228,7 +228,7 @@ def _build_chains(model: mujoco.MjModel, device: wp.Device) -> Chains:
 
 
 class Kinematics:
-    """Paddle path, feet and head of N worlds, from the state path of a :class:`~pace.sim.engine.RobotEngine`.
+    """Paddle path, feet and head of N worlds, from the state path of a :class:`~pace.sim.engine.base.RobotEngine`.
 
     Attributes (float32, world frame; the same tensors for ever, overwritten by :meth:`update`):
         paddle_path: (N, S + 1, 12): centre (m), unit normal (the link's x axis), linear velocity of the centre (m/s),

@@ -1,6 +1,6 @@
 """Per-world draws of robot, motor, ball, air and contact parameters, and of pushes.
 
-Draws are made where a mask says so, on the device (:mod:`pace.sim.draws`), so that a reset never waits for the host.
+Draws are made where a mask says so, on the device (:mod:`pace.arrays.draws`), so that a reset never waits for the host.
 """
 
 from __future__ import annotations
@@ -9,11 +9,12 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from pace.config import BallConfig, ConfigError, RandomizationConfig
-from pace.sim.ball import BallParams
-from pace.sim.draws import Column, Draws
-from pace.sim.engine import EngineParams
-from pace.sim.sharing import record, share
+from pace.arrays.draws import Column, Draws
+from pace.arrays.share import record, share
+from pace.config.base import ConfigError
+from pace.config.sim import BallConfig, RandomizationConfig
+from pace.sim.ball.ball import BallParams
+from pace.sim.engine.base import EngineParams
 
 #: Engine parameters that are drawn straight from the range of the same name.
 ENGINE_DRAWS = ("friction", "trunk_mass", "trunk_com", "kp_scale", "kd_scale", "armature_scale", "effort_scale")

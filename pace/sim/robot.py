@@ -8,7 +8,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from pace.config import ConfigError, EngineConfig, JointGroup, RobotConfig, TableConfig
+from pace.config.base import ConfigError
+from pace.config.sim import EngineConfig, JointGroup, RobotConfig, TableConfig
 
 SCENE = Path(__file__).parent / "assets" / "scene.xml"
 

@@ -12,8 +12,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from pace.config import SensingConfig
-from pace.sim.sharing import record, share
+from pace.arrays.share import record, share
+from pace.config.sim import SensingConfig
 
 if TYPE_CHECKING:
     from pace.sim.worlds import RobotState

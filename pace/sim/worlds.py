@@ -10,14 +10,15 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from pace.config import SimConfig
-from pace.sim.ball import BallParams, BallSim
-from pace.sim.engine import make_engine, resolve_device
+from pace.arrays.share import record, require_shape, share
+from pace.arrays.state import under_prefix, with_prefix
+from pace.config.sim import SimConfig
+from pace.devices import resolve_device
+from pace.sim.ball.ball import BallParams, BallSim
+from pace.sim.engine.factory import make_engine
 from pace.sim.kinematics import Kinematics
 from pace.sim.randomization import Randomizer
 from pace.sim.robot import JOINT_NAMES, build_model, nominal_pose
-from pace.sim.sharing import record, require_shape, share
-from pace.sim.snapshot import under_prefix, with_prefix
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,9 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
 
-from pace.config import ConfigError
-from pace.rl.checkpoint import CheckpointError
-from pace.rl.loading import load_predictor
+from pace.config.base import ConfigError
+from pace.rl.policies import load_predictor
+from pace.runs.checkpoint import CheckpointError
 from pace.studies import adaptation, motors, parity, posture, predictor, reaction, rounding, senses, steps
 from pace.studies.swings import Swings, policy_swings, random_swings
 

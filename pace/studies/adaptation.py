@@ -11,12 +11,12 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from pace.rl.env import TableTennisEnv
-from pace.rl.evaluation import COLUMNS, C, ServeRecorder, play, wilson
-from pace.rl.loading import TaskPolicy, load_policy
-from pace.rl.observations import POLICY, layout
-from pace.rl.outcome import Outcome
+from pace.evaluation.serves import COLUMNS, C, ServeRecorder, play, wilson
+from pace.rl.policies import TaskPolicy, load_policy
 from pace.studies.common import COLOURS, ENDLESS, markdown
+from pace.task.env import TableTennisEnv
+from pace.task.observations import POLICY, layout
+from pace.task.outcome import Outcome
 
 HIT_SPEED = 6.0  # m/s along the normal, at which paddles are told apart
 #: Restitution at HIT_SPEED below which a paddle belongs to the group; randomization=wide goes from 0.38 to 0.87.

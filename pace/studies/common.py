@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pace.config import TrainConfig, load_train_config
+from pace.config.training import TrainConfig, load_train_config
 from pace.sim.robot import JOINT_NAMES, RIGHT_ARM, build_model
 
 Array = NDArray[np.float64]

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from pace.config import TrainConfig
-from pace.predictor.train import ServePractice
-from pace.sim.ball import BallParams, BallSim
+from pace.config.training import TrainConfig
+from pace.rl.practice import ServePractice
+from pace.sim.ball.ball import BallParams, BallSim
 from pace.sim.randomization import BALL_DRAWS, BALL_LIMITS
 
 AXES = ("x", "y", "z")

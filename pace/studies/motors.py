@@ -14,13 +14,15 @@ import numpy as np
 import torch
 from mujoco.batch import Batch
 
-from pace.config import ConfigError, RobotConfig, load_train_config
-from pace.rl.env import TableTennisEnv
-from pace.rl.evaluation import ServeRecorder, play, summarise
-from pace.rl.loading import TaskPolicy, load_policy
-from pace.sim.engine_native import stop_timers
+from pace.config.base import ConfigError
+from pace.config.sim import RobotConfig
+from pace.config.training import load_train_config
+from pace.evaluation.serves import ServeRecorder, play, summarise
+from pace.rl.policies import TaskPolicy, load_policy
+from pace.sim.engine.native import stop_timers
 from pace.sim.robot import JOINT_NAMES, motor_lines
 from pace.studies.common import ENDLESS, Array, markdown, model_of, study_config
+from pace.task.env import TableTennisEnv
 
 ROBOT = "robot=t1"  # the limit is of configs/, not of a policy that was trained before it
 WITHOUT, WITH = "without", "with"

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pace.config import TrainConfig
+from pace.config.training import TrainConfig
 from pace.studies.flights import FlightModel
 
 SMALLEST_NOISE = 1e-4  # m: a clean position is taken as known to this

@@ -10,11 +10,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from pace.rl.env import TableTennisEnv
-from pace.rl.evaluation import ServeRecorder, play
-from pace.rl.loading import TaskPolicy, load_policy
+from pace.evaluation.serves import ServeRecorder, play
+from pace.rl.policies import TaskPolicy, load_policy
 from pace.sim.robot import CONTACT_BODIES
 from pace.studies.common import ENDLESS, markdown
+from pace.task.env import TableTennisEnv
 
 SEED = 7
 #: Phases of play: a ball that can be hit is in the air, or none.

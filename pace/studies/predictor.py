@@ -12,10 +12,11 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from pace.config import TrainConfig, compose, parse
+from pace.config.base import compose, parse
+from pace.config.training import TrainConfig
+from pace.evaluation.report import bin_label
 from pace.predictor.regression import BIN_NAMES, TIME_BINS
-from pace.rl.evaluation_report import bin_label
-from pace.rl.loading import load_predictor
+from pace.rl.policies import load_predictor
 from pace.studies.common import COLOURS, markdown
 from pace.studies.flights import Recording, record
 from pace.studies.posterior import Question, answer

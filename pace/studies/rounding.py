@@ -9,8 +9,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from pace.rl.loading import TaskPolicy, load_policy
-from pace.rl.policy import MLP, Policy
+from pace.rl.agent import MLP, Policy
+from pace.rl.policies import TaskPolicy, load_policy
 from pace.studies.common import ENDLESS, markdown
 
 STEPS = 100  # control steps that each world plays

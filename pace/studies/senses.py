@@ -9,10 +9,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from pace.config import ConfigError
-from pace.rl.env import TableTennisEnv
-from pace.rl.loading import TaskPolicy, load_policy
+from pace.config.base import ConfigError
+from pace.rl.policies import TaskPolicy, load_policy
 from pace.studies.common import ENDLESS, markdown
+from pace.task.env import TableTennisEnv
 
 TIMES = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)  # s since the episode began
 SEED = 5

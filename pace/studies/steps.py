@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from pace.sim.engine import make_engine
+from pace.sim.engine.factory import make_engine
 from pace.sim.kinematics import Kinematics
 from pace.studies.common import ARM, COLOURS, Array, markdown, model_of, quantiles, study_config
 from pace.studies.swings import Windows

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from pace.rl.loading import load_policy
+from pace.rl.policies import load_policy
 from pace.sim.worlds import Worlds
 from pace.studies.common import smooth_swings, standing, study_config
 

@@ -6,10 +6,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from pace.config import ConfigError, TrainConfig, compose, load_train_config, parse
+from pace.config.base import ConfigError, compose, parse
+from pace.config.training import TrainConfig, load_train_config
 from pace.predictor.filter import CONTACT_HEIGHT, FALL, RISE, FlightFilter, rebound, solve
 from pace.predictor.network import PredictorNetwork
-from pace.predictor.train import ServePractice
+from pace.rl.practice import ServePractice
 
 WINDOW = 45
 DT = 0.02  # s

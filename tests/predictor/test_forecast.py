@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from pace.predictor import Forecast, forecast_flight
-from pace.sim import reference
-from pace.sim.ball import BallParams, BallSim, ball_preset
-from pace.sim.trials import far_path, first_contacts, random_returns
+from pace.sim.ball.ball import BallParams, BallSim, ball_preset
+from pace.studies import ball_reference as reference
+from pace.studies.ball_trials import far_path, first_contacts, random_returns
 
 DT = 0.02
 TABLE = ball_preset("rubber").table

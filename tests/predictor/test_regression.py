@@ -8,11 +8,11 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from test_network import predictor_config, serves
 
-from pace.config import PredictorConfig
+from pace.config.task import PredictorConfig
 from pace.predictor.network import PredictorNetwork
 from pace.predictor.regression import BIN_NAMES, PredictorTrainer
+from tests.helpers.predictor import predictor_config, serves
 
 STEPS, WORLDS = 4, 256
 

@@ -9,13 +9,15 @@ from pathlib import Path
 import pytest
 import torch
 
-from pace.config import ConfigError, Stage, TrainConfig, load_train_config
-from pace.rl.checkpoint import load_checkpoint
+from pace.config.base import ConfigError
+from pace.config.overrides import stage_tasks
+from pace.config.training import Stage, TrainConfig, load_train_config
 from pace.rl.curriculum import Curriculum
-from pace.rl.loading import load_policy, stage_tasks
-from pace.rl.milestones import read_metrics
+from pace.rl.policies import load_policy
 from pace.rl.train import main
-from tests.rl.fakes import config
+from pace.runs.checkpoint import load_checkpoint
+from pace.runs.metrics import read_metrics
+from tests.helpers.fakes import config
 
 WORLDS, STEPS = 8, 6
 UPDATE = WORLDS * STEPS

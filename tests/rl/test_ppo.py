@@ -7,13 +7,14 @@ import math
 
 import pytest
 import torch
-from dummy import DummyTask
-from test_policy import CPU, small_algo
 
-from pace.config import AlgoConfig, ConfigError, SchedulePoint
-from pace.rl.policy import Agent
+from pace.config.base import ConfigError
+from pace.config.training import AlgoConfig, SchedulePoint
+from pace.rl.agent import Agent
 from pace.rl.ppo import PPO
 from pace.rl.rollout import Rollout, RolloutError
+from tests.helpers.algo import CPU, small_algo
+from tests.helpers.dummy import DummyTask
 
 
 def played(config: AlgoConfig, worlds: int = 32, steps: int = 8) -> tuple[Agent, Rollout]:

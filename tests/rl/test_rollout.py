@@ -5,12 +5,12 @@ from __future__ import annotations
 import re
 
 import torch
-from dummy import DummyTask
-from test_policy import CPU, small_algo
 from torch import Tensor
 
-from pace.rl.policy import Agent
+from pace.rl.agent import Agent
 from pace.rl.rollout import Rollout
+from tests.helpers.algo import CPU, small_algo
+from tests.helpers.dummy import DummyTask
 
 STEPS = 6
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from pace.rl.checkpoint import load_checkpoint
-from pace.rl.milestones import read_metrics
 from pace.rl.train import main
+from pace.runs.checkpoint import load_checkpoint
+from pace.runs.metrics import read_metrics
 
 WORLDS = 8
 UPDATE = WORLDS * 12

@@ -11,16 +11,17 @@ from pathlib import Path
 
 import pytest
 import torch
-from dummy import DummyTask
 from omegaconf import OmegaConf
 
-from pace.config import ConfigError, SchedulePoint, TrainConfig, load_train_config, parse, to_dict
+from pace.config.base import ConfigError, parse, to_dict
+from pace.config.training import SchedulePoint, TrainConfig, load_train_config
 from pace.predictor.network import PredictorNetwork
-from pace.rl.checkpoint import CheckpointError, list_checkpoints, load_checkpoint
-from pace.rl.milestones import read_metrics
 from pace.rl.rollout import RolloutError
-from pace.rl.run_folder import RunFolder
 from pace.rl.trainer import Trainer, summarise
+from pace.runs.checkpoint import CheckpointError, list_checkpoints, load_checkpoint
+from pace.runs.metrics import read_metrics
+from pace.runs.run_folder import RunFolder
+from tests.helpers.dummy import DummyTask
 
 WORLDS = 64
 UPDATE = WORLDS * 12

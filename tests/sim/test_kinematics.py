@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from pace.config import load_train_config
+from pace.config.training import load_train_config
 from pace.sim.kinematics import Kinematics
 from pace.sim.robot import build_model
 

@@ -10,11 +10,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from pace.config import BallConfig, TrainConfig, load_train_config
-from pace.sim.ball import ball_preset
+from pace.config.sim import BallConfig
+from pace.config.training import TrainConfig, load_train_config
+from pace.sim.ball.ball import ball_preset
 from pace.sim.randomization import BALL_DRAWS, BALL_LIMITS
-from pace.sim.trials import PRESETS
 from pace.sim.worlds import Worlds
+from pace.studies.ball_trials import PRESETS
 
 WORLDS = 3
 EVERY = torch.ones(WORLDS, dtype=torch.bool)

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from pace.config import load_train_config
+from pace.config.training import load_train_config
 from pace.sim import render
 from pace.sim.render import Ball, Line, RenderError, SceneRenderer, caption, top_camera
 from pace.sim.robot import NOMINAL_KEY, build_model

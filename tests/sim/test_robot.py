@@ -6,7 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from pace.config import ConfigError, load_train_config
+from pace.config.base import ConfigError
+from pace.config.training import load_train_config
 from pace.sim.robot import CONTACT_BODIES, JOINT_NAMES, NOMINAL_KEY, build_model, joint_gains, nominal_pose
 
 #: joint: (lower, upper, effort) in rad and N m, from the maker's description; every other joint mirrors its sibling.

@@ -9,9 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from pace.config import SensingConfig
+from pace.config.sim import SensingConfig
 from pace.sim.sensing import Sensing
-from tests.rl.fakes import CPU, config, fake_robot
+from tests.helpers.fakes import CPU, config, fake_robot
 
 DT = 0.02
 NONE = torch.zeros(4, dtype=torch.bool)

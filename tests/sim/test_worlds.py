@@ -5,7 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from pace.config import ConfigError, TaskConfig, load_train_config
+from pace.config.base import ConfigError
+from pace.config.task import TaskConfig
+from pace.config.training import load_train_config
 from pace.sim.worlds import Worlds
 
 CLEAN = ["randomization=none", "engine=native", "engine.physics_dt=0.005"]

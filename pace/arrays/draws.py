@@ -1,0 +1,84 @@
+"""Uniform draws for some of N worlds, made in a kernel: worlds that are not asked for cost nothing.
+
+Torch would draw for all N and keep few, in several operators for each quantity; a reset of a few worlds would then take
+as long as one of all.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from pace.arrays.share import record, share
+
+
+@wp.struct
+class ColumnArrays:
+    """:class:`Column` in the kernel's form."""
+
+    values: wp.array[wp.float32]
+    low: float
+    high: float
+    least: float
+    most: float
+
+
+@wp.kernel
+def _draw(mask: wp.array[wp.bool], seed: wp.array[wp.int32], columns: wp.array[ColumnArrays]):
+    """Draw all columns of one world."""
+    world = wp.tid()
+    if not mask[world]:
+        return
+    random = wp.rand_init(seed[0], world)
+    for i in range(columns.shape[0]):
+        column = columns[i]
+        value = column.low + wp.randf(random) * (column.high - column.low)
+        column.values[world] = wp.clamp(value, column.least, column.most)
+
+
+class Column(NamedTuple):
+    """Where one number of each world is kept, and what it is drawn from."""
+
+    values: Tensor  # (N,) float32, of any stride
+    low: float
+    high: float
+    least: float = -float("inf")  # what is drawn is kept within these
+    most: float = float("inf")
+
+
+class Draws:
+    """Draws columns of numbers anew where a mask says so; each call takes one number from the generator.
+
+    Args:
+        columns: what is drawn; their tensors are written in place.
+        generator: source of the kernel's seeds, on the columns' device.
+    """
+
+    def __init__(self, columns: Sequence[Column], generator: torch.Generator) -> None:
+        self._columns, self._generator = columns, generator  # the kernel knows the tensors by address alone
+        num_worlds, device = columns[0].values.shape[0], columns[0].values.device
+        self._mask = torch.zeros(num_worlds, dtype=torch.bool, device=device)
+        self._seed = torch.zeros(1, dtype=torch.int32, device=device)
+        where = wp.device_from_torch(device)
+        table = wp.array([_arrays(column) for column in columns], dtype=ColumnArrays, device=where)
+        self._draw = record(_draw, num_worlds, [share(self._mask), share(self._seed), table], device)
+
+    def __call__(self, mask: Tensor) -> None:
+        """Draw for the worlds of ``mask`` (N,) bool; the others keep what they have."""
+        self._mask.copy_(mask)
+        self._seed.random_(generator=self._generator)
+        self._draw()
+
+
+def _arrays(column: Column) -> ColumnArrays:
+    arrays = ColumnArrays()
+    arrays.values = share(column.values)
+    arrays.low, arrays.high, arrays.least, arrays.most = column[1:]
+    return arrays
+
+
+def columns_of(values: Tensor, ranges: Sequence[Sequence[float]]) -> list[Column]:
+    """The columns of ``values`` (N, C), each with its range."""
+    return [Column(column, *ends) for column, ends in zip(values.unbind(1), ranges, strict=True)]

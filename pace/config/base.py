@@ -1,0 +1,81 @@
+"""Typed configuration: one dataclass per group of ``configs/``, and the check of YAML against it.
+
+Every number of the task, the physics and the learning lives in the YAML files, with its unit and source. The classes
+here say which keys exist and of what type they are; an unknown key, a wrong type or a value out of range raises
+:class:`ConfigError` with the key's full name.
+"""
+
+from __future__ import annotations
+
+from dataclasses import is_dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+Range = list[float]
+T = TypeVar("T")
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot be used; the message names the key and the cure."""
+
+
+def config_dir() -> Path:
+    """Folder of the YAML files: inside an installed wheel, or at the root of a checkout."""
+    package = Path(__file__).resolve().parents[1]
+    for candidate in (package / "configs", package.parent / "configs"):
+        if candidate.is_dir():
+            return candidate
+    raise ConfigError(f"no configs/ folder beside {package}: reinstall pace-table-tennis or run from a checkout")
+
+
+def require(condition: bool, message: str) -> None:
+    if not condition:
+        raise ConfigError(message)
+
+
+def check_range(name: str, value: Range, lowest: float | None = None) -> None:
+    require(len(value) == 2, f"{name} must be [low, high], got {value}")
+    require(value[0] <= value[1], f"{name}: low {value[0]} is above high {value[1]}")
+    if lowest is not None:
+        require(value[0] >= lowest, f"{name}: {value[0]} is below {lowest}")
+
+
+def parse(config: DictConfig | dict[str, Any], schema: type[T]) -> T:
+    """Check ``config`` against a dataclass and return an instance of it.
+
+    Errors: :class:`ConfigError` that names the key, for an unknown or missing key, a wrong type or a bad value.
+    """
+    plain = config if isinstance(config, DictConfig) else OmegaConf.create(config)
+    try:
+        OmegaConf.resolve(plain)
+        merged = OmegaConf.merge(OmegaConf.structured(schema), plain)
+        return OmegaConf.to_object(merged)  # type: ignore[return-value]
+    except OmegaConfBaseException as error:
+        key = getattr(error, "full_key", None) or "?"
+        reason = str(error).split("\n")[0]
+        raise ConfigError(f"configuration key '{key}': {reason}") from error
+
+
+def compose(config_name: str, overrides: list[str] | None = None) -> DictConfig:
+    """Compose ``configs/<config_name>.yaml`` with Hydra overrides, for tests, notebooks and rebuilt runs."""
+    from hydra import compose as hydra_compose
+    from hydra import initialize_config_dir
+    from hydra.core.global_hydra import GlobalHydra
+
+    outer = GlobalHydra.instance().hydra  # set while a command runs, which may compose other configurations
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(config_dir=str(config_dir()), version_base="1.3"):
+            return hydra_compose(config_name=config_name, overrides=overrides or [])
+    finally:
+        GlobalHydra.instance().hydra = outer
+
+
+def to_dict(config: Any) -> dict[str, Any]:
+    """A dataclass of this module as plain nested dictionaries, ready for YAML or JSON."""
+    if not is_dataclass(config):
+        raise ConfigError(f"not a configuration: {type(config).__name__}")
+    return OmegaConf.to_container(OmegaConf.structured(config))  # type: ignore[return-value]

@@ -1,0 +1,172 @@
+"""The other commands: bench, evaluate, export, play, ablate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pace.config.base import require
+from pace.config.training import TrainConfig
+
+
+@dataclass
+class BenchOptions:
+    """What ``python -m pace.bench`` measures, and how long."""
+
+    parts: list[str]  # of physics, mjwarp, update, train, memory
+    repeats: int
+    settle_steps: int  # control steps
+    control_steps: int
+    mjwarp_steps: int  # control steps
+    action_std: float
+    update_worlds: int
+    policy_size: int
+    critic_size: int
+    train_updates: int
+    memory_updates: int
+
+    def __post_init__(self) -> None:
+        known = ("physics", "mjwarp", "update", "train", "memory")
+        for part in self.parts:
+            require(part in known, f"bench.parts: {part!r} is not one of {', '.join(known)}")
+        for name, value in vars(self).items():
+            if isinstance(value, int):
+                require(value >= 1, f"bench.{name} must be at least 1, got {value}")
+
+
+@dataclass
+class BenchConfig(TrainConfig):
+    """``python -m pace.bench``: what is trained, and how it is measured."""
+
+    bench: BenchOptions
+
+
+@dataclass
+class PaperRow:
+    """A row of the paper's table II."""
+
+    serves: int
+    hit: float  # share of the serves
+    success: float  # share of the serves
+
+
+@dataclass
+class VariationConfig:
+    """Values of each change of ``python -m pace.evaluation --sweep``, one change at a time."""
+
+    ball: list[str]  # presets; []: all of configs/ball/
+    engine: list[str]
+    noise: list[float]  # times the sensing noise
+    latency: list[float]  # s added to the delay of motion capture
+    friction: list[float]  # added to the friction of the robot's bodies
+    trunk_mass: list[float]  # kg added
+    gain: list[float]  # times kp and kd
+
+    def __post_init__(self) -> None:
+        for name in ("noise", "latency", "gain"):
+            require(min(getattr(self, name), default=0.0) >= 0, f"variations.{name} must not be negative")
+
+
+@dataclass
+class EvaluateConfig:
+    """``python -m pace.evaluation``: which policy, on what task, how many serves."""
+
+    run: str | None
+    policy: str  # run, zero, random
+    rows: list[str]  # names of configs/serve/
+    serves: int  # at least so many a row
+    warmup_serves: int  # first serves of each world, not counted
+    num_worlds: int
+    device: str
+    seed: int
+    physics_dt: float  # s
+    overrides: list[str]  # of the saved task
+    out: str | None
+    progress: bool
+    sweep: bool
+    sweep_serves: int  # at least so many a row of a cell
+    sweep_serves_slow: int  # the same for mjwarp on a CPU
+    sweep_rows: list[str]
+    variations: VariationConfig
+    paper: dict[str, PaperRow]
+
+    def __post_init__(self) -> None:
+        require(self.policy in ("run", "zero", "random"), f"policy must be run, zero or random, not {self.policy!r}")
+        require(self.policy != "run" or self.run is not None, "which run? give its folder, or policy=zero|random")
+        require(len(self.rows) > 0 or self.sweep, "rows must name at least one serve range")
+        require(len(self.sweep_rows) > 0 or not self.sweep, "sweep_rows must name at least one serve range")
+        for name in ("serves", "sweep_serves", "sweep_serves_slow", "num_worlds"):
+            require(getattr(self, name) >= 1, f"{name} must be at least 1, got {getattr(self, name)}")
+        require(self.warmup_serves >= 0, f"warmup_serves must not be negative, got {self.warmup_serves}")
+
+
+@dataclass
+class ExportConfig:
+    """``python -m pace.deploy.export``: which policy, where to, and how it is checked."""
+
+    run: str | None
+    out: str
+    check_worlds: int
+    check_steps: int
+    tolerance: float  # rad, m, s
+    seed: int
+
+    def __post_init__(self) -> None:
+        require(self.run is not None, "which run? give its folder, a checkpoint or pretrained/<name>")
+        for name in ("check_worlds", "check_steps"):
+            require(getattr(self, name) >= 1, f"{name} must be at least 1, got {getattr(self, name)}")
+
+
+@dataclass
+class PlayConfig:
+    """``python -m pace.viewer``: which policy, where it is shown, or what is filmed."""
+
+    run: str | None
+    host: str
+    port: int
+    speed: float  # of time; 1: real time
+    seed: int
+    physics_dt: float  # s
+    overrides: list[str]  # of the saved task
+    video: str | None
+    seconds: float  # of play
+    width: int  # pixels of each view
+    height: int
+    fps: int
+
+    def __post_init__(self) -> None:
+        require(self.run is not None, "which run? give its folder, a checkpoint or pretrained/<name>")
+        require(0 < self.speed <= 1, f"speed must lie in (0, 1], got {self.speed}")
+        require(1 <= self.port <= 65535, f"port must lie in 1 to 65535, got {self.port}")
+        require(self.video is None or self.video.endswith(".mp4"), f"video must end in .mp4, got {self.video}")
+        for name in ("seconds", "fps"):
+            require(getattr(self, name) > 0, f"{name} must be positive, got {getattr(self, name)}")
+        for name in ("width", "height"):
+            value = getattr(self, name)
+            require(value > 0 and value % 2 == 0, f"{name} must be an even number of pixels, got {value}")
+
+
+@dataclass
+class AblateConfig:
+    """``python -m pace.studies.ablate``: which experiments, with which seeds, and how long."""
+
+    experiments: list[str]  # names of configs/experiment/
+    seeds: list[int]
+    samples: float  # control steps of each run
+    jobs: int  # runs at a time
+    window: float  # control steps that a point of a curve averages over
+    run_dir: str
+    out: str | None  # null: run_dir
+    figure: str  # its name in out
+    train: bool
+    overrides: list[str]  # of the training
+    progress: bool
+
+    def __post_init__(self) -> None:
+        for name in ("experiments", "seeds"):
+            values = getattr(self, name)
+            require(len(values) > 0, f"{name} must name at least one")
+            require(len(set(values)) == len(values), f"{name} names one twice: {values}")
+        for name in ("samples", "window"):
+            require(getattr(self, name) > 0, f"{name} must be positive, got {getattr(self, name)}")
+        require(self.jobs >= 1, f"jobs must be at least 1, got {self.jobs}")
+        require(self.figure.endswith(".png"), f"figure must end in .png, got {self.figure}")

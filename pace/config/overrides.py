@@ -1,0 +1,83 @@
+"""Changing the task that was saved with a policy or a run."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from pace.config.base import ConfigError, compose, parse, to_dict
+from pace.config.training import TrainConfig
+
+#: Groups of configs/ that may be chosen anew for a saved policy; networks and observations may not.
+TASK_GROUPS = ("ball", "serve", "reset", "randomization", "sensing", "reward", "robot")
+
+
+#: Parts of a saved task of which single values may be changed.
+CHANGEABLE = (*TASK_GROUPS, "engine")
+
+
+#: Changes of a saved task that is played on a CPU, one world or a few, whatever it was trained on.
+ON_A_CPU = ("engine=native", "engine.threads=1", "engine.graph=auto")
+
+
+def stage_tasks(config: TrainConfig, samples: float = math.inf) -> list[TrainConfig]:
+    """``config``, and what each stage of its curriculum that has begun by ``samples`` makes of the one before.
+
+    Errors: :class:`ConfigError` for a change that the task does not know, which names the stage.
+    """
+    tasks = [config]
+    for stage in config.curriculum:
+        if stage.samples > samples:
+            break
+        try:
+            tasks.append(override_task(tasks[-1], stage.task))
+        except ConfigError as error:
+            raise ConfigError(f"curriculum, from {stage.samples:g} control steps on: {error}") from error
+    return tasks
+
+
+def override_task(config: TrainConfig, overrides: Sequence[str]) -> TrainConfig:
+    """A saved configuration with parts of its task changed; ``config`` itself stays as it is.
+
+    An override is a choice of a group, ``ball=paper`` (of :data:`TASK_GROUPS`; ``engine=native`` keeps the saved
+    solver), or a value, ``engine.physics_dt=0.002``. Choices are applied before values, later ones win.
+
+    Errors: :class:`ConfigError` for anything else, and for keys and values that the configuration does not know.
+    """
+    choices: dict[str, str] = {}
+    values: list[str] = []
+    for override in overrides:
+        key, equals, choice = override.partition("=")
+        if not equals:
+            raise ConfigError(f"override '{override}' is not of the form key=value")
+        if key in TASK_GROUPS:
+            choices[key] = choice
+        elif key == "engine":
+            values.append(f"engine.name={choice}")
+        elif key.split(".")[0] in CHANGEABLE:
+            values.append(override)
+        else:
+            raise ConfigError(f"'{key}' cannot change for a saved policy; {', '.join(TASK_GROUPS)} and engine can")
+    merged: dict[str, Any] = to_dict(config)
+    merged |= _choose(choices)
+    try:
+        changed = OmegaConf.merge(OmegaConf.create(merged), OmegaConf.from_dotlist(values))
+    except OmegaConfBaseException as error:
+        raise ConfigError(str(error).split("\n")[0]) from error
+    return parse(OmegaConf.to_container(changed), TrainConfig)  # type: ignore[arg-type]
+
+
+def _choose(choices: Mapping[str, str]) -> dict[str, Any]:
+    """The choice of each group, from configs/."""
+    if not choices:
+        return {}
+    try:
+        fresh = compose("train", [f"{group}={choice}" for group, choice in choices.items()])
+    except HydraException as error:
+        raise ConfigError(" ".join(str(error).split())) from error
+    return {group: fresh[group] for group in choices}

@@ -1,0 +1,187 @@
+"""What the physics worlds need: robot, ball, engine, randomization, sensing."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields
+
+from pace.config.base import Range, check_range, require
+
+
+@dataclass
+class JointGroup:
+    """Gains and limits of the joints whose name contains one of ``match``."""
+
+    match: list[str]
+    kp: float  # N m / rad
+    kd: float  # N m s / rad
+    effort: float  # N m
+    max_speed: float = 0.0  # rad/s, at which the motor gives no torque; needed where robot.stall_ratio is on
+
+
+@dataclass
+class RobotConfig:
+    """The robot: control rate, gains, nominal pose."""
+
+    name: str
+    control_dt: float  # s
+    action_scale: float  # rad per unit of action
+    action_clip: float  # largest |action|
+    armature: float  # kg m^2
+    base_height: float  # m, base above the floor at reset
+    joint_groups: list[JointGroup]  # the first match of a joint counts
+    nominal_pose: dict[str, float]  # rad; joints not named stand at 0
+    stall_ratio: float = 0.0  # stall torque over effort; 0: full effort at any speed, as before there was a limit
+
+    def __post_init__(self) -> None:
+        require(self.control_dt > 0, "robot.control_dt must be positive")
+        known = self.stall_ratio == 0 or 1 <= self.stall_ratio < math.inf
+        require(known, f"robot.stall_ratio must be 0 (no limit) or a number from 1 on, got {self.stall_ratio}")
+        slow = [group.match for group in self.joint_groups if group.max_speed <= 0]
+        require(not (self.stall_ratio and slow), f"robot.stall_ratio needs the max_speed of the joint groups {slow}")
+        require(self.action_clip > 0, "robot.action_clip must be positive")
+
+
+@dataclass
+class TableConfig:
+    """Table, net, floor and paddle as the ball meets them; world frame, origin under the table's centre."""
+
+    length: float  # m, along x
+    width: float  # m, along y
+    height: float  # m, top above the floor
+    thickness: float  # m
+    net_height: float  # m above the top
+    net_overhang: float  # m past each side line
+    paddle_radius: float  # m
+    paddle_half_thickness: float  # m, blade and rubber
+    floor_restitution: float
+    floor_friction: float
+    net_restitution: float
+    net_friction: float
+
+
+@dataclass
+class BallConfig:
+    """Ball, air and contacts. Restitution is ``e0 - slope * |v_n|``, never below ``min_restitution``."""
+
+    name: str
+    mass: float  # kg
+    radius: float  # m
+    air_density: float  # kg / m^3
+    drag_coefficient: float
+    magnus_coefficient: float
+    table_restitution: float
+    table_restitution_slope: float  # s / m
+    table_friction: float
+    paddle_restitution: float
+    paddle_restitution_slope: float  # s / m
+    paddle_friction: float
+    table: TableConfig
+    min_restitution: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("mass", "radius"):
+            require(getattr(self, name) > 0, f"ball.{name} must be positive")
+        for name in ("table_restitution", "paddle_restitution"):
+            require(0 <= getattr(self, name) <= 1, f"ball.{name} must lie in [0, 1]")
+
+
+@dataclass
+class RandomizationConfig:
+    """Per-world draws at each reset. ``[1, 1]`` scales and ``[0, 0]`` offsets are a clean run."""
+
+    name: str
+    friction: Range  # sliding friction of robot bodies with floor and table
+    trunk_mass: Range  # kg added
+    trunk_com: Range  # m added, each axis
+    kp_scale: Range
+    kd_scale: Range
+    armature_scale: Range
+    effort_scale: Range
+    actuator_delay: Range  # s
+    push_velocity: Range  # m/s, x and y, added to the base
+    push_interval: Range  # s between pushes; [0, 0] is no push
+    ball_mass_scale: Range
+    drag_scale: Range
+    magnus: Range  # added to the Magnus coefficient
+    table_restitution: Range  # added
+    table_friction: Range  # added
+    paddle_restitution: Range  # added
+    paddle_friction: Range  # added
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            if f.name != "name":
+                check_range(f"randomization.{f.name}", getattr(self, f.name))
+        require(self.effort_scale[0] > 0, "randomization.effort_scale must be positive")
+
+
+@dataclass
+class SensingConfig:
+    """What the robot's sensors add to the truth: uniform noise (+- amplitude) and delay."""
+
+    name: str
+    base_angular_velocity: float  # rad/s
+    base_position: float  # m
+    projected_gravity: float
+    joint_position: float  # rad
+    joint_velocity: float  # rad/s
+    ball_position: float  # m
+    heading: float
+    base_shift: float  # m
+    mocap_delay: Range  # s, drawn per world at reset: ball, base position and heading
+    noise_scale: Range = field(default_factory=lambda: [1.0, 1.0])  # of all amplitudes, drawn per world at reset
+    moved: float = 0.03  # m; a ball seen so much further away than two control steps before has turned: noise does less
+
+    def __post_init__(self) -> None:
+        check_range("sensing.mocap_delay", self.mocap_delay, lowest=0.0)
+        check_range("sensing.noise_scale", self.noise_scale, lowest=0.0)
+        require(self.moved >= 0, f"sensing.moved must not be negative, got {self.moved}")
+
+
+@dataclass
+class EngineConfig:
+    """The physics engine and its solver."""
+
+    name: str  # auto, native, mjwarp
+    physics_dt: float  # s
+    solver_iterations: int
+    line_search_iterations: int
+    cone: str  # pyramidal, elliptic
+    threads: int  # native: 0 is all cores
+    contacts_per_world: int  # mjwarp: room for contacts
+    constraints_per_world: int  # mjwarp: room for constraint rows
+    paddle_reaction: bool  # the ball's impulse acts on the paddle over the next control step
+    ball_dt: float  # s, longest sub-step of the ball's flight
+    graph: str = "auto"  # of CUDA for steps and resets on a GPU, of Warp for mjwarp on a CPU: auto, always, never
+
+    def __post_init__(self) -> None:
+        require(self.name in ("auto", "native", "mjwarp"), f"engine must be auto, native or mjwarp, not {self.name!r}")
+        require(self.physics_dt > 0, "engine.physics_dt must be positive")
+        require(
+            self.graph in ("auto", "always", "never"), f"engine.graph must be auto, always or never, not {self.graph!r}"
+        )
+        require(self.cone in ("pyramidal", "elliptic"), "engine.cone must be pyramidal or elliptic")
+        require(self.threads >= 0, "engine.threads must be 0 (all cores) or more")
+        for name in ("solver_iterations", "line_search_iterations", "contacts_per_world", "constraints_per_world"):
+            require(getattr(self, name) >= 1, f"engine.{name} must be at least 1")
+
+
+@dataclass
+class SimConfig:
+    """What the physics worlds need: a part of every command's configuration."""
+
+    robot: RobotConfig
+    ball: BallConfig
+    engine: EngineConfig
+    randomization: RandomizationConfig
+
+    @property
+    def substeps(self) -> int:
+        """Physics steps of one control step."""
+        count = round(self.robot.control_dt / self.engine.physics_dt)
+        require(
+            count >= 1 and abs(count * self.engine.physics_dt - self.robot.control_dt) < 1e-9,
+            f"engine.physics_dt {self.engine.physics_dt} must divide robot.control_dt {self.robot.control_dt}",
+        )
+        return count

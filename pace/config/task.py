@@ -1,0 +1,248 @@
+"""The table-tennis task: serves, resets, rewards, observations, predictor."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields
+
+from pace.config.base import Range, check_range, require
+from pace.config.sim import SensingConfig, SimConfig
+
+
+@dataclass
+class ServeConfig:
+    """Where serves start and how fast they are, and when a serve is over."""
+
+    name: str
+    x: Range  # m
+    y: Range  # m
+    z: Range  # m
+    vx: Range  # m/s
+    vy: Range  # m/s
+    vz: Range  # m/s
+    spin: Range  # rad/s, each axis
+    max_duration: float  # s since the serve began
+    end_after_hit: float  # s after the paddle hit; 0 switches it off
+    end_height: float  # m; a ball below it ends the serve
+    serves_per_episode: int  # 0: the worlds play on without end
+    random_phase: bool  # first episodes begin at a random serve, so that resets spread over time
+    head_start: Range = field(default_factory=lambda: [0.0, 0.0])  # s of its flight that an episode's first serve skips
+
+    def __post_init__(self) -> None:
+        for name in ("x", "y", "z", "vx", "vy", "vz", "spin"):
+            check_range(f"serve.{name}", getattr(self, name))
+        check_range("serve.head_start", self.head_start, 0.0)
+        require(self.max_duration > 0, "serve.max_duration must be positive")
+        require(self.serves_per_episode >= 0, "serve.serves_per_episode must be 0 (no end) or more")
+
+
+@dataclass
+class ResetConfig:
+    """Where the robot starts, and where an episode is lost."""
+
+    base_x: Range  # m, world
+    base_y: Range  # m, world
+    yaw: Range  # rad
+    linear_velocity: Range  # m/s, each axis
+    roll_pitch_rate: Range  # rad/s
+    yaw_rate: Range  # rad/s
+    joint_scale: Range  # legs, waist and left arm: nominal times this
+    right_arm_offset: Range  # rad: right arm: nominal plus this
+    min_base_height: float  # m; below it the robot has fallen
+    bounds_x: Range  # m
+    bounds_y: Range  # m
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            if f.name != "min_base_height":
+                check_range(f"reset.{f.name}", getattr(self, f.name))
+
+
+@dataclass
+class RewardTerm:
+    """One term: its weight, multiplied by the control step, and the numbers that it needs."""
+
+    weight: float
+    params: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass
+class RewardConfig:
+    """The reward: its terms by name, the target that the hit terms share, and the scale that the learner sees."""
+
+    name: str
+    scale: float  # the learner sees scale * sum of the terms
+    target_x: float  # m; the paddle's target is the apex, or where the ball later passes this x
+    target_mode: str  # "intercept": later of apex and x = target_x; "clamp": apex with its x clamped (released code)
+    arm_offset: list[float]  # m; base target = target_xy + arm_offset
+    idle_base_xy: list[float]  # m; base target while there is nothing to hit
+    idle_height: float  # m; height of the paddle's target meanwhile
+    nothing_to_hit: dict[str, float]  # past_x, low_z, falling_x (m): when the prediction terms are off
+    terms: dict[str, RewardTerm]
+
+    def __post_init__(self) -> None:
+        require(self.target_mode in ("intercept", "clamp"), "reward.target_mode must be intercept or clamp")
+        for name in ("arm_offset", "idle_base_xy"):
+            require(len(getattr(self, name)) == 2, f"reward.{name} needs two numbers, got {getattr(self, name)}")
+        given, needed = sorted(self.nothing_to_hit), ["falling_x", "low_z", "past_x"]
+        require(given == needed, f"reward.nothing_to_hit needs exactly {', '.join(needed)}; got {', '.join(given)}")
+
+
+@dataclass
+class ReturnMemoryConfig:
+    """What the robot remembers of its own returns (:class:`pace.onboard.returns.ReturnMemory`)."""
+
+    prior: float  # restitution before the first hit
+    prior_hits: float  # hits that the prior is worth
+    hits: float  # older hits fade once there are that many
+    reach: float  # m; a ball further from the paddle when it is seen to turn was turned by something else
+    closing_speed: float  # m/s along the normal; a slower hit tells nothing
+    largest: float  # largest single estimate
+
+    def __post_init__(self) -> None:
+        for name in ("prior_hits", "reach", "closing_speed", "largest"):
+            require(getattr(self, name) > 0, f"observation.return_memory.{name} must be positive")
+        require(self.hits >= 1, "observation.return_memory.hits must be at least 1")
+        require(0 <= self.prior <= self.largest, "observation.return_memory.prior must lie in [0, largest]")
+
+
+@dataclass
+class DelayEstimateConfig:
+    """How the robot finds out how late its motion capture is (:class:`pace.onboard.delay.DelayEstimate`)."""
+
+    prior: float  # s, before anything was seen
+    prior_worth: float  # rad^2/s^2, sum of squared changes of the yaw rate that the prior is worth
+    smoothing: float  # share of the filtered turns that is left a control step later
+    fading: float  # share of the sums that is left a control step later
+
+    def __post_init__(self) -> None:
+        require(self.prior >= 0, f"observation.delay_estimate.prior must not be negative, got {self.prior}")
+        require(self.prior_worth > 0, "observation.delay_estimate.prior_worth must be positive")
+        for name in ("smoothing", "fading"):
+            value = getattr(self, name)
+            require(0 < value <= 1, f"observation.delay_estimate.{name} must lie in (0, 1], got {value}")
+
+
+@dataclass
+class AttitudeEstimateConfig:
+    """How the robot knows its orientation better than its sensors (:class:`pace.onboard.attitude.AttitudeEstimate`)."""
+
+    gain: float  # share of what is sensed in each control step's estimate; the rest is the last one, turned on
+
+    def __post_init__(self) -> None:
+        require(0 < self.gain <= 1, f"observation.attitude_estimate.gain must lie in (0, 1], got {self.gain}")
+
+
+@dataclass
+class JointEstimateConfig:
+    """How the robot knows its joints better than its encoders (:class:`pace.onboard.joints.JointEstimate`)."""
+
+    acceleration: float  # rad/s^2, root mean square over a control step
+    position_noise: float  # rad, root mean square, of what is sensed
+    velocity_noise: float  # rad/s, the same
+
+    def __post_init__(self) -> None:
+        for name in ("acceleration", "position_noise", "velocity_noise"):
+            value = getattr(self, name)
+            good = 0 < value < math.inf
+            require(good, f"observation.joint_estimate.{name} must be positive and finite, got {value}")
+
+
+#: Numbers of the observation's configuration -> the actor's observations that need them.
+OBSERVED_FROM = {
+    "return_memory": ("last_return",),
+    "delay_estimate": ("sensed_delay",),
+    "attitude_estimate": ("estimated_gravity", "estimated_heading"),
+    "joint_estimate": ("estimated_joint_position", "estimated_joint_velocity"),
+}
+
+
+@dataclass
+class ObservationConfig:
+    """Names of the observations of each network, in order, and how many control steps of history each sees."""
+
+    name: str
+    policy: list[str]
+    critic: list[str]
+    policy_history: int
+    critic_history: int
+    # each needed by its observations of OBSERVED_FROM; the last two, observed, give the paddle's pose too
+    return_memory: ReturnMemoryConfig | None = None
+    delay_estimate: DelayEstimateConfig | None = None
+    attitude_estimate: AttitudeEstimateConfig | None = None
+    joint_estimate: JointEstimateConfig | None = None
+
+    @property
+    def memory(self) -> ReturnMemoryConfig | None:
+        """Numbers of the memory of returns, where the policy observes it."""
+        return self.return_memory if self.observed_from("return_memory") else None
+
+    @property
+    def delay(self) -> DelayEstimateConfig | None:
+        """Numbers of the estimate of the delay, where the policy observes it."""
+        return self.delay_estimate if self.observed_from("delay_estimate") else None
+
+    @property
+    def attitude(self) -> AttitudeEstimateConfig | None:
+        """Numbers of the filter of the orientation, where the policy observes it."""
+        return self.attitude_estimate if self.observed_from("attitude_estimate") else None
+
+    @property
+    def joints(self) -> JointEstimateConfig | None:
+        """Numbers of the filter of the joints, where the policy observes it."""
+        return self.joint_estimate if self.observed_from("joint_estimate") else None
+
+    def observed_from(self, numbers: str) -> list[str]:
+        """Which of the policy's observations need these numbers, a key of ``OBSERVED_FROM``."""
+        return [name for name in OBSERVED_FROM[numbers] if name in self.policy]
+
+    def __post_init__(self) -> None:
+        for name in ("policy", "critic"):
+            require(len(getattr(self, name)) > 0, f"observation.{name} must name at least one")
+        require(self.policy_history >= 1, "observation.policy_history must be at least 1")
+        require(self.critic_history >= 1, "observation.critic_history must be at least 1")
+
+
+COUNTED_FRAMES = 5  # the last positions that ``predictor.features=counted`` sees
+
+
+FRAME_DT = 0.02  # s, between the positions that ``predictor.features=flight`` fits
+
+
+@dataclass
+class PredictorConfig:
+    """The learned predictor of the ball's apex and its online regression."""
+
+    name: str
+    frames: int  # past ball positions it sees
+    hidden: list[int]
+    learning_rate: float
+    batch_size: int
+    batches_per_update: int
+    train_updates: int  # frozen afterwards; 0 trains it to the end
+    outputs: list[str]  # of apex (3), target (3), target_time (1)
+    enabled: bool  # off: the actor sees zeros instead (ablation)
+    features: str = "steps"  # steps (positions alone), counted (the last five, and how many there were before them), or
+    # flight (a fit of the whole flight); the latter two need many frames
+
+    def __post_init__(self) -> None:
+        known = ("steps", "counted", "flight")
+        require(self.features in known, f"predictor.features must be steps, counted or flight, not {self.features!r}")
+        enough = self.features != "counted" or self.frames > COUNTED_FRAMES
+        require(enough, f"predictor.features=counted needs more than {COUNTED_FRAMES} frames, got {self.frames}")
+        require(self.learning_rate > 0, "predictor.learning_rate must be positive")
+        for name in ("batch_size", "batches_per_update"):
+            require(getattr(self, name) >= 1, f"predictor.{name} must be at least 1, got {getattr(self, name)}")
+        require(min(self.hidden, default=1) >= 1, "predictor.hidden: a layer has at least 1 unit")
+
+
+@dataclass
+class TaskConfig(SimConfig):
+    """The table-tennis task: the worlds, and what is asked, sensed and rewarded in them."""
+
+    serve: ServeConfig
+    reset: ResetConfig
+    reward: RewardConfig
+    sensing: SensingConfig
+    observation: ObservationConfig
+    predictor: PredictorConfig

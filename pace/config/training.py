@@ -1,0 +1,133 @@
+"""The learner and the run."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from pace.config.base import compose, parse, require
+from pace.config.task import FRAME_DT, TaskConfig
+
+
+@dataclass
+class SchedulePoint:
+    """A value from ``samples`` control steps on; between points it is interpolated linearly."""
+
+    samples: float
+    value: float
+
+
+@dataclass
+class AlgoConfig:
+    """Asymmetric PPO."""
+
+    name: str
+    steps: int  # control steps a world plays per update
+    epochs: int
+    minibatches: int
+    actor_hidden: list[int]
+    critic_hidden: list[int]
+    gamma: float
+    gae_lambda: float
+    clip: float
+    value_coefficient: float
+    clip_value: bool
+    entropy: list[SchedulePoint]
+    std: list[SchedulePoint]  # upper limit of the policy's standard deviation; the first value is the initial one
+    std_floor: float
+    learning_rate: float
+    learning_rate_min: float
+    learning_rate_max: float
+    kl_target: list[SchedulePoint]  # mean KL divergence of an update that the learning rate is adapted to
+    max_grad_norm: float
+    observation_clip: float
+    last_layer_gain: float
+    autocast: str  # auto (bf16 where the hardware has it, down to fp32_below), bf16, fp32
+    later_steps: list[SchedulePoint] = field(default_factory=list)  # in place of steps from that many control steps on
+    fp32_below: float = 0.0  # mean std of the policy below which autocast=auto computes in float32
+    observation_norm: bool = True  # by their running mean and spread; off: observations in their own units, clipped
+
+    def steps_at(self, samples: float) -> int:
+        """Control steps a world plays per update, ``samples`` control steps into the run."""
+        due = [point for point in self.later_steps if point.samples <= samples]
+        return int(max(due, key=lambda point: point.samples).value) if due else self.steps
+
+    def __post_init__(self) -> None:
+        for point in self.later_steps:
+            whole = point.value >= 1 and point.value == int(point.value)
+            require(whole, f"algo.later_steps: {point.value} is no number of steps")
+        require(self.autocast in ("auto", "bf16", "fp32"), "algo.autocast must be auto, bf16 or fp32")
+        require(self.fp32_below >= 0, "algo.fp32_below is a standard deviation: it cannot be negative")
+        for name in ("gamma", "gae_lambda"):
+            require(0 < getattr(self, name) <= 1, f"algo.{name} must lie in (0, 1]")
+        lowest, first, highest = self.learning_rate_min, self.learning_rate, self.learning_rate_max
+        in_order = 0 < lowest <= first <= highest
+        require(in_order, "algo needs 0 < learning_rate_min <= learning_rate <= learning_rate_max")
+        for name in ("clip", "max_grad_norm", "observation_clip"):
+            require(getattr(self, name) > 0, f"algo.{name} must be positive")
+        for name in ("actor_hidden", "critic_hidden"):
+            require(min(getattr(self, name), default=1) >= 1, f"algo.{name}: a layer has at least 1 unit")
+        for name in ("steps", "epochs", "minibatches"):
+            require(getattr(self, name) >= 1, f"algo.{name} must be at least 1")
+        for name in ("entropy", "std", "kl_target"):
+            require(len(getattr(self, name)) >= 1, f"algo.{name} needs at least one point")
+        for name in ("std", "kl_target"):
+            require(all(point.value > 0 for point in getattr(self, name)), f"algo.{name} must be positive")
+
+
+@dataclass
+class Stage:
+    """Changes of the task from ``samples`` control steps of a run on: overrides as ``sensing=wide``."""
+
+    samples: float
+    task: list[str]
+
+
+@dataclass
+class TrainConfig(TaskConfig):
+    """``python -m pace.rl.train``: the task, the learner and the run."""
+
+    algo: AlgoConfig
+    name: str
+    num_worlds: int  # in all processes together
+    processes: int  # 0: one a core with 256 worlds or more each on a CPU, one on a GPU
+    device: str  # auto, cpu, cuda, cuda:1
+    seed: int
+    samples: float  # control steps in all; whichever of samples and minutes ends first
+    minutes: float  # wall-clock; 0: no limit
+    run_dir: str | None  # null: runs/<date>_<name>
+    resume: str | None  # a run folder or checkpoint to go on from
+    init_from: str | None  # a run folder or checkpoint whose weights to start from
+    checkpoint_minutes: float
+    tensorboard: bool
+    progress: bool
+    # a run folder or checkpoint whose predictor to start from, instead of that of init_from
+    predictor_from: str | None = field(default=None, kw_only=True)
+    curriculum: list[Stage] = field(default_factory=list, kw_only=True)  # each changes the task of the one before
+
+    def __post_init__(self) -> None:
+        require(self.num_worlds >= 1, f"num_worlds must be at least 1, got {self.num_worlds}")
+        require(self.processes >= 0, f"processes must be 0 (chosen for the machine) or more, got {self.processes}")
+        require(
+            self.processes == 0 or self.num_worlds % self.processes == 0,
+            f"num_worlds {self.num_worlds} cannot be shared equally by {self.processes} processes",
+        )
+        fits = self.predictor.features != "flight" or math.isclose(self.robot.control_dt, FRAME_DT)
+        require(fits, f"predictor.features=flight needs robot.control_dt {FRAME_DT} s, got {self.robot.control_dt}")
+        require(self.samples > 0, "samples must be positive")
+        require(self.minutes >= 0, f"minutes must not be negative (0: no limit), got {self.minutes}")
+        require(not (self.resume and self.init_from), "give resume or init_from, not both")
+        require(not (self.resume and self.predictor_from), "give resume or predictor_from, not both")
+        begins = [stage.samples for stage in self.curriculum]
+        require(begins == sorted(set(begins)), f"curriculum: the stages must begin one after another, got {begins}")
+        require(all(begin > 0 for begin in begins), "curriculum: a stage at 0 is the task itself; change that")
+
+
+def load_train_config(overrides: list[str] | None = None) -> TrainConfig:
+    """The training configuration of ``configs/train.yaml`` with Hydra overrides such as ``["num_worlds=64"]``."""
+    return parse(compose("train", overrides), TrainConfig)
+
+
+# What a resumed run may change; everything else is as it was saved, or the run would not go on where it stopped.
+# Other processes play other worlds, which begin anew.
+RESUME_KEYS = ("resume", "samples", "minutes", "checkpoint_minutes", "tensorboard", "progress", "device", "processes")

@@ -1,0 +1,40 @@
+"""What this machine has: its GPU, and its cores."""
+
+from __future__ import annotations
+
+import os
+
+import torch
+
+from pace.config.base import ConfigError
+
+
+def resolve_device(device: str | torch.device) -> torch.device:
+    """``auto``, ``cpu``, ``cuda`` or ``cuda:1`` as a torch device; ``auto`` is the first GPU, or the CPU without one.
+
+    Errors: :class:`ConfigError` for a device that is unknown, or not there.
+    """
+    if str(device) == "auto":
+        return torch.device("cuda:0" if torch.cuda.is_available() else "cpu")
+    try:
+        resolved = torch.device(device)
+    except RuntimeError as error:
+        raise ConfigError(f"device must be auto, cpu, cuda or cuda:<number>, not {device!r}") from error
+    if resolved.type not in ("cpu", "cuda"):
+        raise ConfigError(f"device must be auto, cpu, cuda or cuda:<number>, not {str(device)!r}")
+    if resolved.type == "cuda":
+        count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+        if (resolved.index or 0) >= count:
+            raise ConfigError(f"device {device} is not there: torch sees {count} GPU(s); use device=cpu")
+        return torch.device("cuda", resolved.index or 0)
+    return torch.device("cpu")
+
+
+def usable_cores() -> int:
+    """Cores that this process may use: a job's share of a machine where the system tells, or all of them."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def threads_of(size: int) -> int:
+    """Threads for each of ``size`` processes on this machine."""
+    return max(1, usable_cores() // size)

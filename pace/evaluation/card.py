@@ -1,0 +1,77 @@
+"""The card of a kept policy: what it is, how it was trained, how well it plays and how to play it, as Markdown."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pace.evaluation.report import markdown_table
+from pace.rl.policies import saved_config
+from pace.runs.checkpoint import load_checkpoint
+
+CARD = "README.md"
+EVALUATION, SWEEP, VERSIONS = "evaluation.json", "sweep.json", "versions.json"
+GROUPS = ("robot", "ball", "serve", "randomization", "sensing", "observation", "reward", "predictor", "algo")
+#: Of the machine that played, not of what was played.
+MACHINE = ("engine.threads=", "engine.graph=", "engine.physics_dt=")
+
+
+def card(folder: Path, notes: str = "") -> str:
+    """The card of the policy in ``folder``, from the files that lie there; ``notes`` stand below its first table."""
+    parts = [f"# {folder.name}", _facts(folder, _read(folder / VERSIONS)), notes.strip()]
+    evaluation, sweep = _read(folder / EVALUATION), _read(folder / SWEEP)
+    parts += [_evaluation(folder, evaluation)] if evaluation.get("rows") else []
+    parts += [_sweep(sweep)] if sweep.get("cells") else []
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _read(file: Path) -> dict[str, Any]:
+    return json.loads(file.read_text()) if file.is_file() else {}
+
+
+def _facts(folder: Path, versions: Mapping[str, Any]) -> str:
+    checkpoint = load_checkpoint(folder, weights_only=True)
+    counters, config = checkpoint.counters, saved_config(checkpoint)
+    command = versions.get("command", [])[1:]
+    named = [(group, getattr(config, group).name) for group in GROUPS]
+    rows = [
+        ("task, at the end", ", ".join(f"`{group}={name}`" for group, name in named)),
+        ("curriculum", ", ".join(f"{stage.samples / 1e6:g} M: {' '.join(stage.task)}" for stage in config.curriculum)),
+        ("seed", str(config.seed)),
+        ("control steps", f"{counters['samples'] / 1e6:.1f} million"),
+        ("time", f"{counters['wall_s'] / 3600:.1f} h, {config.num_worlds:,} worlds"),
+        ("last command", f"`python -m pace.rl.train {' '.join(command)}`" if command else ""),
+        ("versions", ", ".join(f"{name} {number}" for name, number in versions.get("packages", {}).items() if number)),
+    ]
+    return markdown_table(("", ""), [row for row in rows if row[1]]).replace("---:", "---")
+
+
+def _evaluation(folder: Path, found: Mapping[str, Any]) -> str:
+    overrides = [text for text in found["overrides"] if not text.startswith(MACHINE)]
+    fixed = [f"{key}={found[key]}" for key in ("physics_dt", "num_worlds", "warmup_serves", "seed")]
+    serves = f"serves={min(row['serves'] for row in found['rows'])}"
+    command = " ".join(["python -m pace.evaluation", f"pretrained/{folder.name}", *fixed, serves, *overrides])
+    table = markdown_table(
+        ("serves", "number", "hit %", "success %", "falls per 1,000"), [_row(row) for row in found["rows"]]
+    )
+    return f"## How well it plays\n\n`{command}`\n\n{table}"
+
+
+def _sweep(found: Mapping[str, Any]) -> str:
+    rows = [
+        [f"{cell['kind'].replace('_', ' ')} {cell['value']}".strip(), *_row(row)]
+        for cell in found["cells"]
+        for row in cell["rows"]
+    ]
+    head = ("change", "serves", "number", "hit %", "success %", "falls per 1,000")
+    return f"## What it survives\n\n{markdown_table(head, rows)}"
+
+
+def _row(row: Mapping[str, Any]) -> Sequence[str]:
+    hit, success = (
+        f"{100 * row[name]:.1f} ({100 * row[f'{name}_low']:.1f} to {100 * row[f'{name}_high']:.1f})"
+        for name in ("hit", "success")
+    )
+    return row["serve"].replace("_", "-"), f"{row['serves']:,}", hit, success, f"{row['falls_per_1000']:.1f}"

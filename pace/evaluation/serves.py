@@ -1,0 +1,282 @@
+"""Counting what a policy does with many serves: the rows of the paper's table II.
+
+Each of N worlds plays on without end and contributes the same number of serves, whatever becomes of them: a stop at a
+total would favour serves that end early, which are the lost ones. The first two serves of a world are not counted (the
+paper's rule); those after a fall are, for the fall is the policy's own doing.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pace.predictor.network import predictor_slices
+from pace.predictor.regression import BIN_NAMES, TIME_BINS
+from pace.rl.policies import TaskPolicy
+from pace.task.env import TableTennisEnv
+from pace.task.game import Outcome
+
+#: Columns of a serve's record, m and m/s, world frame. NaN where there is none.
+COLUMNS = (
+    "serve_vx", "serve_vy", "serve_vz",  # at launch
+    "outcome",  # pace.task.game.Outcome
+    "hit", "rim", "fall",  # 0 or 1; fall: the robot fell, or left its area, before the serve was over
+    "strike_x", "strike_y", "strike_z",  # where the paddle met the ball
+    "speed_out",  # of the ball after the hit
+    "landing_x", "landing_y", "net_height",  # of the flight after the hit (its forecast, which is the simulation)
+)  # fmt: skip
+C = {name: index for index, name in enumerate(COLUMNS)}
+#: What can become of a serve without success; ``rim`` goes before where the ball went from there.
+FAILURES = ("miss", "net", "out", "own_side", "rim", "double_hit", "volley", "fall")
+#: Outcomes that a hit by the rim accounts for.
+RIM_FAULTS = (Outcome.NET, Outcome.OUT, Outcome.OWN_SIDE)
+Z95 = 1.959963984540054  # 97.5 % quantile of the normal distribution
+PATH_WORLDS = 6  # worlds whose footwork is kept
+PATH_STEPS = 400  # control steps of it, 8 s
+PATIENCE = 4  # times the longest that the serves can take: then serves keep missing the table
+STEPS_PER_LOOK = 10  # control steps between two looks at the counts: each look waits for the device
+
+OnCount = Callable[[int], None]
+
+
+class EvaluationError(RuntimeError):
+    """An evaluation that cannot be finished; the message says why."""
+
+
+def wilson(count: int, total: int) -> tuple[float, float]:
+    """95 % confidence interval of a share (E. B. Wilson 1927); NaN when nothing was counted."""
+    if total == 0:
+        return math.nan, math.nan
+    share, square = count / total, Z95**2 / total
+    centre = (share + square / 2) / (1 + square)
+    half = Z95 * math.sqrt(share * (1 - share) / total + square / (4 * total)) / (1 + square)
+    return max(0.0, centre - half), min(1.0, centre + half)
+
+
+class ServeRecorder:
+    """Writes down, on the device, what becomes of each serve of an environment's worlds.
+
+    Call :meth:`begin` after the worlds' reset, :meth:`observe` after each ``advance`` and before the reset of fallen
+    worlds, :meth:`begin` again after that.
+
+    Attributes: ``records`` (N * quota + 1, columns), world by world, the last row of no meaning; ``counted``,
+    ``played``, ``bad`` (N,); ``path`` (T, W, 3) base x, y (m) and number of the serve, NaN where not filled.
+    """
+
+    def __init__(self, env: TableTennisEnv, warmup_serves: int, quota: int) -> None:
+        n, device = env.num_worlds, env.worlds.device
+        self.env, self.quota, self._warmup = env, quota, warmup_serves
+        self.records = torch.full((n * quota + 1, len(COLUMNS)), torch.nan, device=device)
+        self.counted, self.played, self.bad = (torch.zeros(n, dtype=torch.long, device=device) for _ in range(3))
+        self.path = torch.full((PATH_STEPS, min(n, PATH_WORLDS), 3), torch.nan, device=device)
+        self._current = torch.full((n, len(COLUMNS)), torch.nan, device=device)
+        self._first_row = torch.arange(n, device=device) * quota
+        self._started = torch.ones(n, dtype=torch.bool, device=device)
+        self._edges = torch.tensor(TIME_BINS, device=device)
+        self._squares = torch.zeros(2, len(BIN_NAMES), device=device)
+        self._apex = predictor_slices(env.config.predictor.outputs)["apex"]
+        self._steps = 0
+
+    @property
+    def serves_per_world(self) -> int:
+        """Serves that each world plays, if none is bad."""
+        return self._warmup + self.quota
+
+    @property
+    def counting(self) -> Tensor:
+        """Worlds (N,) bool whose present serve will be counted."""
+        return (self.played >= self._warmup) & (self.counted < self.quota)
+
+    def begin(self) -> None:
+        """Note the launch of the serves that begin now, and the prediction that the policy is about to act on."""
+        fresh = torch.full_like(self._current, torch.nan)
+        fresh[:, :3] = self.env.worlds.ball.velocity
+        fresh[:, C["hit"] : C["fall"] + 1] = 0.0
+        self._current.copy_(torch.where(self._started.unsqueeze(-1), fresh, self._current))
+        self._note_prediction()
+
+    def observe(self) -> None:
+        """Take in the control step that was just made."""
+        self._note_hits()
+        self._note_path()
+        self._close(self.env.serve_over)
+
+    def _note_hits(self) -> None:
+        env = self.env
+        events, returns = env.worlds.ball.events, env.game.returns
+        speed = torch.linalg.vector_norm(events.hit_velocity_out, dim=1, keepdim=True)
+        rim = events.hit_rim.unsqueeze(-1).float()
+        hit = torch.cat((torch.ones_like(rim), rim, torch.zeros_like(rim), events.hit_point, speed), dim=1)
+        hit = torch.cat((hit, returns.landing[:, :2], returns.net_height.unsqueeze(-1)), dim=1)
+        now = env.game.referee.hit_now.unsqueeze(-1)
+        columns = self._current[:, C["hit"] :]
+        columns.copy_(torch.where(now, hit, columns))
+
+    def _note_prediction(self) -> None:
+        env = self.env
+        error = (env.actor.prediction - env.predictor_target)[:, self._apex].square().sum(1)
+        weight = (env.predictor_valid & self.counting).float()
+        bins = torch.bucketize(env.predictor_time_to_apex, self._edges, right=True)
+        self._squares[0].index_add_(0, bins, error * weight)
+        self._squares[1].index_add_(0, bins, weight)
+
+    def _note_path(self) -> None:
+        if self._steps < PATH_STEPS:
+            worlds = self.path.shape[1]
+            self.path[self._steps, :, :2] = self.env.worlds.robot.base_position[:worlds, :2]
+            self.path[self._steps, :, 2] = self.played[:worlds]
+        self._steps += 1
+
+    def _close(self, over: Tensor) -> None:
+        env = self.env
+        self._current[:, C["outcome"]] = env.serve_outcome.float()
+        self._current[:, C["fall"]] = env.terminated.float()
+        bad = env.serve_outcome == Outcome.BAD_SERVE
+        due = over & self.counting
+        kept = due & ~bad
+        rows = torch.where(kept, self._first_row + self.counted, self.records.shape[0] - 1)
+        self.records.index_copy_(0, rows, self._current)
+        self.counted += kept
+        self.bad += due & bad
+        self.played += over
+        self._started.copy_(over)
+
+    def predictor_errors(self) -> tuple[float, dict[str, float]]:
+        """RMSE of the predicted apex (3-D, cm): over all, and by time to the apex; NaN without a predictor."""
+        if self.env.actor.predictor is None:
+            return math.nan, dict.fromkeys(BIN_NAMES, math.nan)
+        totals = torch.cat((self._squares.sum(1, keepdim=True), self._squares), dim=1)
+        overall, *by_time = (100.0 * (totals[0] / totals[1]).sqrt()).tolist()
+        return overall, dict(zip(BIN_NAMES, by_time, strict=True))
+
+
+@dataclass(frozen=True)
+class Row:
+    """One serve range: the summary that files hold; every counted serve (M, columns of ``COLUMNS``) and the footwork of
+    some worlds (T, W, 3) as in :class:`ServeRecorder`, on the CPU."""
+
+    summary: dict[str, Any]
+    records: Tensor
+    path: Tensor
+    seconds: float  # wall-clock
+
+    @property
+    def serve(self) -> str:
+        """Name of the serve range."""
+        return self.summary["serve"]
+
+
+def play(env: TableTennisEnv, policy: TaskPolicy, recorder: ServeRecorder, on_count: OnCount | None = None) -> None:
+    """Play until every world has its serves. ``on_count`` hears how many have been counted in all.
+
+    Errors: :class:`EvaluationError` when serves keep missing the robot's half, or a value is not finite. A
+    ``RuntimeWarning`` when the engine had no room for all contacts.
+    """
+    total = env.num_worlds * recorder.quota
+    longest = math.ceil(env.config.serve.max_duration / env.worlds.control_dt) + 1
+    recorder.begin()
+    for step in range(1, PATIENCE * longest * recorder.serves_per_world + 1):
+        env.advance(policy(env.policy_observation))
+        recorder.observe()
+        env.reset_worlds(env.terminated)
+        recorder.begin()
+        if step % STEPS_PER_LOOK == 0:
+            counted = int(recorder.counted.sum())
+            if on_count is not None:
+                on_count(counted)
+            if counted == total:
+                break
+    else:
+        raise EvaluationError(f"only {counted} of {total} serves were playable: the others miss the robot's half")
+    bad = env.first_bad()
+    if bad is not None:
+        raise EvaluationError(bad)
+    env.warn_of_overflow()
+
+
+def evaluate_row(
+    policy: TaskPolicy,
+    serve: str,
+    serves: int = 5000,
+    num_worlds: int = 512,
+    device: str = "auto",
+    seed: int = 1,
+    overrides: Sequence[str] = (),
+    warmup_serves: int = 2,
+    on_count: OnCount | None = None,
+) -> Row:
+    """Play at least ``serves`` serves of the range ``serve`` (a name of configs/serve/), without end.
+
+    ``overrides`` as for :func:`~pace.config.overrides.override_task`. The same arguments, on the same
+    device, give the same row.
+
+    Errors: :class:`pace.config.ConfigError` for unknown names and keys.
+    """
+    started = time.perf_counter()
+    endless = ("serve.serves_per_episode=0", "serve.end_after_hit=0")
+    env = policy.make_env(num_worlds, device, seed, ["reset=evaluation", f"serve={serve}", *overrides, *endless])
+    recorder = ServeRecorder(env, warmup_serves, math.ceil(serves / num_worlds))
+    play(env, policy, recorder, on_count)
+    records = recorder.records[:-1].cpu()
+    target = env.config.reward.terms["predicted_landing"].params
+    table = env.config.ball.table
+    clear = table.height + table.net_height + env.config.ball.radius
+    summary = summarise(serve, records, (target["x"], target["y"]), clear)
+    overall, by_time = recorder.predictor_errors()
+    summary |= {
+        "predictor_rmse_cm": overall,
+        "predictor_rmse_cm_by_time": by_time,
+        "bad_serves": int(recorder.bad.sum()),
+    }
+    return Row(summary, records, recorder.path.cpu(), time.perf_counter() - started)
+
+
+def summarise(serve: str, records: Tensor, target: tuple[float, float], clear_height: float) -> dict[str, Any]:
+    """Rates and means of a row from its records (M, columns).
+
+    Shares are of the serves; ``outbound_speed`` (m/s) is a mean over hits, ``landing_error`` (m, to ``target``) and
+    ``net_clearance`` (m, under the ball; ``clear_height`` m is the lowest that passes) over successes.
+    """
+    total = records.shape[0]
+    hit = records[:, C["hit"]] > 0
+    success = records[:, C["outcome"]] == Outcome.SUCCESS
+    hits, successes = int(hit.sum()), int(success.sum())
+    hit_low, hit_high = wilson(hits, total)
+    success_low, success_high = wilson(successes, total)
+    landing = records[success][:, [C["landing_x"], C["landing_y"]]]
+    error = torch.linalg.vector_norm(landing - torch.tensor(target), dim=1)
+    return {
+        "serve": serve,
+        "serves": total,
+        "hit": hits / max(total, 1),
+        "hit_low": hit_low,
+        "hit_high": hit_high,
+        "success": successes / max(total, 1),
+        "success_low": success_low,
+        "success_high": success_high,
+        "outbound_speed": _mean(records[hit][:, C["speed_out"]]),
+        "landing_error": _mean(error),
+        "net_clearance": _mean(records[success][:, C["net_height"]] - clear_height),
+        "falls_per_1000": 1000.0 * float(records[:, C["fall"]].sum()) / max(total, 1),
+        "rim_hits": int((hit & (records[:, C["rim"]] > 0)).sum()),
+        "failures": count_failures(records),
+    }
+
+
+def _mean(values: Tensor) -> float:
+    """Mean of the values that are there."""
+    return float(values[~values.isnan()].double().mean())
+
+
+def count_failures(records: Tensor) -> dict[str, int]:
+    """What became of the serves without success, by the names of :data:`FAILURES`; the counts add up to them."""
+    outcome, rim = records[:, C["outcome"]], records[:, C["rim"]] > 0
+    by_rim = rim & sum((outcome == code for code in RIM_FAULTS), torch.zeros_like(rim))
+    counts = {name: int(((outcome == Outcome[name.upper()]) & ~by_rim).sum()) for name in FAILURES if name != "rim"}
+    return {name: int(by_rim.sum()) if name == "rim" else counts[name] for name in FAILURES}

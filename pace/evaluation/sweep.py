@@ -1,0 +1,186 @@
+"""What a policy survives: the table again under other balls, engines, sensors and bodies, one change at a time."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from pace.config.base import config_dir, to_dict
+from pace.config.commands import EvaluateConfig, VariationConfig
+from pace.config.overrides import override_task
+from pace.config.sim import RandomizationConfig
+from pace.config.training import TrainConfig
+from pace.devices import resolve_device
+from pace.evaluation.figures import DPI, heat_map
+from pace.evaluation.report import write_json
+from pace.evaluation.serves import EvaluationError
+from pace.rl.policies import TaskPolicy
+
+JSON, MAP = "sweep.json", "sweep.png"
+SERVES_PER_WORLD = 4  # counted, in a cell: more waste less on those that are not, and fill the cores less
+SLOWNESS = 10.0  # times that mjwarp takes on a CPU (docs/speed.md), for the time that is left
+Tables = dict[str, list[dict[str, Any]]]  # summaries of a cell's rows, by its key
+LABELS = {"noise": "sensing noise", "trunk_mass": "trunk mass", "gain": "joint gains"}
+
+
+@dataclass(frozen=True)
+class Variation:
+    """One change of the task: which, its value, and the overrides that make it."""
+
+    kind: str
+    value: str
+    overrides: tuple[str, ...]
+
+    @property
+    def label(self) -> str:
+        """As it stands in the heat map."""
+        return f"{LABELS.get(self.kind, self.kind)} {self.value}".strip()
+
+
+def ball_presets() -> list[str]:
+    """Names of configs/ball/."""
+    return sorted(file.stem for file in (config_dir() / "ball").glob("*.yaml") if not file.stem.startswith("_"))
+
+
+def variations(task: TrainConfig, chosen: VariationConfig) -> list[Variation]:
+    """The task as it is, then each change of ``chosen``; changes start from the values of ``task``."""
+    sensing, bodies = task.sensing, task.randomization
+    cells = [Variation("as given", "", ())]
+    cells += [Variation("ball", name, (f"ball={name}",)) for name in chosen.ball or ball_presets()]
+    cells += [Variation("engine", name, (f"engine={name}",)) for name in chosen.engine]
+    for times in chosen.noise:
+        louder = _range("sensing.noise_scale", [scale * times for scale in sensing.noise_scale])
+        cells.append(Variation("noise", f"x {times:g}", (louder,)))
+    for extra in chosen.latency:
+        later = _range("sensing.mocap_delay", [delay + extra for delay in sensing.mocap_delay])
+        cells.append(Variation("latency", f"+{1000 * extra:g} ms", (later,)))
+    cells += [_shift(bodies, "friction", offset, "", lowest=0.05) for offset in chosen.friction]
+    cells += [_shift(bodies, "trunk_mass", offset, " kg") for offset in chosen.trunk_mass]
+    for times in chosen.gain:
+        stronger = tuple(
+            _range(f"randomization.{n}", [v * times for v in getattr(bodies, n)]) for n in ("kp_scale", "kd_scale")
+        )
+        cells.append(Variation("gain", f"x {times:g}", stronger))
+    return cells
+
+
+def _shift(bodies: RandomizationConfig, name: str, offset: float, unit: str, lowest: float | None = None) -> Variation:
+    moved = [value + offset for value in getattr(bodies, name)]
+    if lowest is not None:
+        moved = [max(value, lowest) for value in moved]
+    return Variation(name, f"{offset:+g}{unit}", (_range(f"randomization.{name}", moved),))
+
+
+def _range(key: str, bounds: Sequence[float]) -> str:
+    return f"{key}=[{bounds[0]:.6g},{bounds[1]:.6g}]"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A variation as it is played: the overrides of the saved task, the device (the CPU for engine=native), serves a
+    row and worlds, and the time that it takes in serves of the fast engine.
+
+    ``key`` tells what its figures depend on: cells of one key are played once, and found again in a sweep's file.
+    """
+
+    variation: Variation
+    overrides: tuple[str, ...]
+    device: str
+    serves: int
+    worlds: int
+    cost: float
+    key: str
+
+
+def engine_name(task: TrainConfig, device_type: str) -> str:
+    """The engine that ``auto`` means on a device."""
+    if task.engine.name != "auto":
+        return task.engine.name
+    return "mjwarp" if device_type == "cuda" else "native"
+
+
+def plan_cell(
+    variation: Variation, config: EvaluateConfig, policy: TaskPolicy, overrides: Sequence[str], program: Any
+) -> Cell:
+    """How ``variation`` of the task of ``policy`` with ``overrides`` is played.
+
+    An engine that is slow on the device plays ``sweep_serves_slow``. ``program``: versions of what computes it.
+    """
+    device = resolve_device(config.device)
+    changed = (*overrides, *variation.overrides)
+    task = override_task(policy.config, changed)
+    task.engine.name = engine_name(task, device.type)
+    if task.engine.name == "native" and device.type == "cuda":
+        device, task.engine.graph = torch.device("cpu"), "auto"  # a GPU's graphs do not go with it
+        changed = (*changed, "engine.graph=auto")
+    slow = task.engine.name == "mjwarp" and device.type == "cpu"
+    serves = config.sweep_serves_slow if slow else config.sweep_serves
+    worlds = min(config.num_worlds, math.ceil(serves / SERVES_PER_WORLD))
+    played = worlds * (config.warmup_serves + math.ceil(serves / worlds)) * len(config.sweep_rows)
+    depends = [policy.source, dict(policy.counters), config.seed, config.warmup_serves, config.sweep_rows, serves]
+    text = json.dumps([*depends, worlds, str(device), program, to_dict(task)], sort_keys=True)
+    key = hashlib.sha256(text.encode()).hexdigest()[:16]
+    return Cell(variation, changed, str(device), serves, worlds, played * (SLOWNESS if slow else 1.0), key)
+
+
+def finished_cells(folder: Path, cells: Sequence[Cell]) -> Tables:
+    """Rows of those ``cells`` that a sweep in ``folder`` has finished, by key; empty where there was none.
+
+    Errors: :class:`EvaluationError` for a ``sweep.json`` that is not one, or has cells of another sweep to lose.
+    """
+    file = folder / JSON
+    if not file.exists():
+        return {}
+    try:
+        tables = {cell["key"]: cell["rows"] for cell in json.loads(file.read_text())["cells"]}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise EvaluationError(f"{file} is no file of a sweep ({error!r}): give another out=") from error
+    if not set(tables) <= {cell.key for cell in cells}:
+        raise EvaluationError(
+            f"{file} is of a sweep with another policy, settings or version of pace: give another out="
+        )
+    return tables
+
+
+def cells_to_play(cells: Sequence[Cell], finished: Tables) -> list[Cell]:
+    """Those ``cells`` that are not ``finished``, one of each key, the slow ones last."""
+    first: dict[str, Cell] = {}
+    for cell in cells:
+        if cell.key not in finished:
+            first.setdefault(cell.key, cell)
+    return sorted(first.values(), key=lambda cell: cell.cost)
+
+
+def write_sweep(folder: Path, cells: Sequence[Cell], tables: Tables, context: Mapping[str, Any]) -> list[Path]:
+    """``sweep.json`` and the heat map in ``folder``, of those ``cells`` that ``tables`` has the rows of.
+
+    Each file is written under another name first, so that an interruption leaves the last one whole.
+    """
+    done = [cell for cell in cells if cell.key in tables]
+    entries = [_entry(cell, tables[cell.key]) for cell in done]
+    files = [folder / JSON, folder / MAP]
+    folder.mkdir(parents=True, exist_ok=True)
+    parts = [file.with_name(f"part_{file.name}") for file in files]
+    write_json(parts[0], {"cells": entries, **context})
+    figure = heat_map(
+        [(cell.variation.kind, cell.variation.label) for cell in done],
+        [tables[cell.key] for cell in done],
+        f"{context['policy']}: one change at a time; engine {context['engine']} unless changed",
+    )
+    figure.savefig(parts[1], dpi=DPI)
+    for part, file in zip(parts, files, strict=True):
+        part.replace(file)
+    return files
+
+
+def _entry(cell: Cell, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    own = cell.variation
+    change = {"kind": own.kind, "value": own.value, "overrides": list(own.overrides)}
+    return {**change, "num_worlds": cell.worlds, "key": cell.key, "rows": list(rows)}

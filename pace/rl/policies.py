@@ -1,0 +1,172 @@
+"""A saved policy in one line, together with the task that it was trained for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from pace.arrays.state import under_prefix
+from pace.config.base import ConfigError, config_dir, parse
+from pace.config.overrides import override_task, stage_tasks
+from pace.config.task import PredictorConfig
+from pace.config.training import TrainConfig
+from pace.devices import resolve_device
+from pace.predictor.network import PredictorNetwork
+from pace.rl.agent import Policy
+from pace.runs.checkpoint import META, TRAINING, WEIGHTS, Checkpoint, CheckpointError, load_checkpoint, load_weights
+from pace.task.observations import JOINTS, POLICY
+
+if TYPE_CHECKING:
+    from pace.task.env import TableTennisEnv
+RANDOM_STD = 0.8  # of the random policy's actions: how widely a training run begins to explore
+
+
+@dataclass(frozen=True)
+class TaskPolicy:
+    """A policy, callable with the raw ``policy`` observation (N, Dp), and what it was trained on.
+
+    Attributes: ``config`` as saved; ``act`` the function behind the call; ``predictor`` the network that the actor's
+    predicted observations come from (``None``: zeros); ``source`` the checkpoint's folder, or the built-in's name;
+    ``counters`` of the training (updates, samples, wall_s).
+    """
+
+    config: TrainConfig
+    act: Callable[[Tensor], Tensor]
+    predictor: PredictorNetwork | None
+    source: str
+    counters: Mapping[str, float] = field(default_factory=dict)
+
+    @torch.no_grad()
+    def __call__(self, observation: Tensor) -> Tensor:
+        """Raw observation (N, Dp) -> action (N, 21), deterministic for a saved policy."""
+        return self.act(observation)
+
+    def to(self, device: str | torch.device) -> TaskPolicy:
+        """Move the networks to ``device``; returns itself."""
+        for part in (self.act, self.predictor):
+            if isinstance(part, torch.nn.Module):
+                part.to(device)
+        return self
+
+    def make_env(
+        self, num_worlds: int = 64, device: str = "auto", seed: int = 1, overrides: Sequence[str] = ()
+    ) -> TableTennisEnv:
+        """The saved task in N worlds, with the saved predictor; the policy moves to the same device.
+
+        ``overrides`` are those of :func:`override_task`, such as ``["serve=mixed", "engine.physics_dt=0.002"]``.
+        Errors: :class:`ConfigError` for a wrong key or value, an engine or a device that is not there.
+        """
+        from pace.task.env import TableTennisEnv  # loads the simulation, which takes seconds
+
+        where = resolve_device(device)
+        self.to(where)
+        config = override_task(self.config, overrides)
+        return TableTennisEnv(config, num_worlds, where, seed, self.predictor)
+
+
+@dataclass(frozen=True)
+class TrainedPredictor:
+    """A saved predictor and how it was configured."""
+
+    config: PredictorConfig
+    network: PredictorNetwork
+
+
+def load_policy(path: str | Path, device: str | torch.device = "cpu") -> TaskPolicy:
+    """The policy of a run folder (its newest checkpoint), a checkpoint, a file in one, or ``pretrained/<name>``.
+
+    Nothing in the files is executed or unpickled.
+
+    Errors: :class:`CheckpointError` for a folder that is no run, another format, a missing, reshaped or broken tensor,
+    and a configuration of another version.
+    """
+    checkpoint = load_checkpoint(locate(path), weights_only=True)
+    config = saved_config(checkpoint)
+    predictor = PredictorNetwork(config.predictor)
+    network = Policy.build(policy_size(config), JOINTS, config.algo)
+    agent = _part(checkpoint, "agent")
+    parts = (
+        ("normaliser", network.norm, under_prefix("policy_norm", agent)),
+        ("actor", network.mlp, under_prefix("actor.mlp", agent)),
+        ("predictor", predictor, _part(checkpoint, "predictor")),
+    )
+    for name, module, weights in parts:
+        load_weights(module, weights, f"{checkpoint.path} ({name})")
+        module.requires_grad_(False).eval()
+    return TaskPolicy(config, network, predictor, str(checkpoint.path), checkpoint.counters).to(device)
+
+
+def load_predictor(path: str | Path) -> TrainedPredictor:
+    """The predictor of a run, of a policy or trained alone; ``path`` and errors as those of :func:`load_policy`."""
+    checkpoint = load_checkpoint(locate(path), weights_only=True)
+    config = saved_config(checkpoint).predictor
+    network = PredictorNetwork(config)
+    load_weights(network, _part(checkpoint, "predictor"), f"{checkpoint.path} (predictor)")
+    return TrainedPredictor(config, network.requires_grad_(False).eval())
+
+
+def locate(path: str | Path) -> Path:
+    """``path``, or the one of that name beside the package's ``configs/`` (so that ``pretrained/<name>`` is found).
+
+    Errors: :class:`CheckpointError` for a file that is no part of a checkpoint.
+    """
+    path = Path(path)
+    if not path.exists() and not path.is_absolute() and (config_dir().parent / path).exists():
+        path = config_dir().parent / path
+    if path.is_file() and path.name not in (META, WEIGHTS, TRAINING):
+        raise CheckpointError(f"{path} is no file of a checkpoint: give a run folder, or a folder with {META}")
+    return path
+
+
+def saved_config(checkpoint: Checkpoint) -> TrainConfig:
+    """The configuration that a checkpoint was trained with last: its task is that of the curriculum's stage.
+
+    Errors: :class:`CheckpointError` when this version of pace does not know its keys.
+    """
+    try:
+        config = parse(checkpoint.config, TrainConfig)
+        return stage_tasks(config, checkpoint.counters.get("samples", 0.0))[-1]
+    except (ConfigError, ValueError) as error:
+        raise CheckpointError(f"{checkpoint.path} is of another version of pace: {error}") from error
+
+
+def policy_size(config: TrainConfig) -> int:
+    """Numbers in the actor's observation: those of a frame, times its history."""
+    unknown = [name for name in config.observation.policy if name not in POLICY]
+    if unknown:
+        raise CheckpointError(f"the policy observes '{unknown[0]}', which this version of pace does not know")
+    return config.observation.policy_history * sum(POLICY[name].size for name in config.observation.policy)
+
+
+def _part(checkpoint: Checkpoint, name: str) -> dict[str, Tensor]:
+    if not isinstance(checkpoint.weights, dict) or name not in checkpoint.weights:
+        raise CheckpointError(f"{checkpoint.path}: the weights of the {name} are missing")
+    return checkpoint.weights[name]
+
+
+def built_in_policy(name: str, seed: int, like: TaskPolicy | None = None, device: str = "cpu") -> TaskPolicy:
+    """``zero``: holds the nominal pose; ``random``: actions N(0, 0.8), new at each step.
+
+    It plays the task of ``like``, or the default one, and sees what that predicts.
+    """
+    from pace.config.training import load_train_config
+
+    config, predictor = (like.config, like.predictor) if like else (load_train_config(), None)
+    where = resolve_device(device)
+    generator = torch.Generator(where).manual_seed(seed)
+
+    def zero(observation: Tensor) -> Tensor:
+        return observation.new_zeros(observation.shape[0], JOINTS)
+
+    def random(observation: Tensor) -> Tensor:
+        shape = (observation.shape[0], JOINTS)
+        return torch.randn(shape, device=where, generator=generator).mul_(RANDOM_STD)
+
+    if name not in ("zero", "random"):
+        raise ConfigError(f"policy must be zero or random, not {name!r}")
+    return TaskPolicy(config, zero if name == "zero" else random, predictor, name)

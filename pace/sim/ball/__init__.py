@@ -1,0 +1,8 @@
+"""The ball: its flight through the air, its rebounds, and the forecast of both.
+
+Public names: :class:`BallParams` (with ``preset``), :class:`BallSim`, :class:`Forecast`.
+"""
+
+from pace.sim.ball.ball import BallParams, BallSim, Forecast
+
+__all__ = ["BallParams", "BallSim", "Forecast"]

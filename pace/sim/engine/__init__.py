@@ -1,0 +1,1 @@
+"""The robot's physics: one protocol, and the engines behind it."""

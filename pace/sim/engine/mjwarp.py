@@ -1,0 +1,123 @@
+"""The MuJoCo Warp engine: thousands of worlds on a GPU, and the same code on Warp's CPU device for tests."""
+
+from __future__ import annotations
+
+import mujoco
+import mujoco_warp as mjw
+import torch
+import warp as wp
+from torch import Tensor
+
+from pace.arrays.graph import CapturedCall, RecordedLaunches, graphs_wanted
+from pace.arrays.share import warp_scope
+from pace.config.sim import EngineConfig
+from pace.sim.engine.base import StateTensors
+from pace.sim.engine.model_fields import ModelFields
+
+#: Overflows that drop contacts or constraints. The solver's iteration limits, which share the bit mask, do not.
+_DROPPED = (
+    mjw.OverflowType.NEFC
+    | mjw.OverflowType.NJMAX_NNZ
+    | mjw.OverflowType.BROADPHASE
+    | mjw.OverflowType.NARROWPHASE
+    | mjw.OverflowType.CCD
+    | mjw.OverflowType.CONTACT_MATCH
+)
+
+
+@wp.kernel
+def _load_targets(targets: wp.array3d[float], step: int, ctrl: wp.array2d[float]):
+    world, joint = wp.tid()
+    ctrl[world, joint] = targets[world, step, joint]
+
+
+@wp.kernel
+def _record_state(
+    qpos: wp.array2d[float],
+    qvel: wp.array2d[float],
+    instant: int,
+    qpos_path: wp.array3d[float],
+    qvel_path: wp.array3d[float],
+):
+    world = wp.tid()
+    for i in range(qpos.shape[1]):
+        qpos_path[world, instant, i] = qpos[world, i]
+    for i in range(qvel.shape[1]):
+        qvel_path[world, instant, i] = qvel[world, i]
+
+
+class MjwarpEngine(StateTensors):
+    """MuJoCo Warp in float32. See :class:`~pace.sim.engine.base.RobotEngine`.
+
+    On a GPU one control step is one CUDA graph, or a part of the environment's (``CapturedCall``).
+    On a CPU its launches are recorded (``RecordedLaunches``). Both hold the addresses of the
+    arrays and the options of the second step: edit values in place, and replace no array of ``model`` or ``data``.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, engine: EngineConfig, num_worlds: int, device: torch.device, substeps: int
+    ) -> None:
+        super().__init__(model, num_worlds, device, substeps, engine.physics_dt)
+        with warp_scope(device):
+            self.model = mjw.put_model(model, batch_sizes=dict.fromkeys(ModelFields.NAMES, num_worlds))
+            self.model.opt.warn_overflow = 0  # a line a world a step; overflowed() tells
+            # On a GPU all iterations are launched, and converged worlds skip theirs: a loop that ends on the device
+            # would interrupt the capture around it, after which torch no longer knows what memory is the graph's.
+            self.model.opt.graph_conditional = device.type == "cpu"
+            self.data = mjw.make_data(
+                model, num_worlds, nconmax=engine.contacts_per_world, njmax=engine.constraints_per_world
+            )
+        fields = {name: wp.to_torch(getattr(self.model, name)) for name in ModelFields.NAMES}
+        self._fields = ModelFields(model, self.params, fields)
+        data = self.data
+        self._qpos, self._qvel = wp.to_torch(data.qpos), wp.to_torch(data.qvel)
+        self._warmstart, self._applied = wp.to_torch(data.qacc_warmstart), wp.to_torch(data.qfrc_applied)
+        self._sensordata, self._actuator_force = wp.to_torch(data.sensordata), wp.to_torch(data.actuator_force)
+        self._overflow = wp.to_torch(data.overflow)
+        self._targets = torch.zeros(num_worlds, substeps, model.nu, device=device)
+        self._warp_targets = wp.from_torch(self._targets)
+        self._warp_path = [wp.from_torch(self.qpos_path), wp.from_torch(self.qvel_path)]
+        if device.type == "cuda":
+            self._step = CapturedCall(self._play, device, graphs_wanted(engine, device))
+        else:
+            self._step = RecordedLaunches(self._play, engine.graph != "never")
+        self._qpos.copy_(self.qpos_path[:, 0])
+
+    def advance(self, targets: Tensor, applied: Tensor) -> None:
+        self._targets.copy_(targets)
+        self._applied.copy_(applied)
+        self._step()
+        self._read_sensors(self._sensordata, self._actuator_force)
+
+    def _play(self) -> None:
+        """The launches of one control step."""
+        with warp_scope(self.device):
+            self._record(0)
+            for step in range(self.substeps):
+                wp.launch(_load_targets, dim=self.data.ctrl.shape, inputs=[self._warp_targets, step, self.data.ctrl])
+                mjw.step(self.model, self.data)
+                self._record(step + 1)
+
+    def _record(self, instant: int) -> None:
+        inputs = [self.data.qpos, self.data.qvel, instant, *self._warp_path]
+        wp.launch(_record_state, dim=self.num_worlds, inputs=inputs)
+
+    def _solver_state(self) -> tuple[Tensor, Tensor, Tensor]:
+        return self._qpos, self._qvel, self._warmstart
+
+    def apply_params(self, mask: Tensor) -> None:
+        self._fields.write(mask)
+
+    def add_velocity(self, delta: Tensor) -> None:
+        self._qvel += delta
+
+    def overflowed(self) -> bool:
+        return bool((self._overflow & int(_DROPPED)).any())
+
+    def state_dict(self) -> dict[str, Tensor]:
+        state = {"qpos": self._qpos, "qvel": self._qvel, "warmstart": self._warmstart}
+        return state | self._outputs()
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        for name, tensor in self.state_dict().items():
+            tensor.copy_(state[name])

@@ -1,0 +1,136 @@
+"""Which model fields follow the parameters of each world, and the kernel that writes them, the same on both engines."""
+
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+import torch
+import warp as wp
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from pace.arrays.share import record, share
+from pace.sim.engine.base import EngineParams
+from pace.sim.robot import TRUNK_BODY
+
+
+@wp.struct
+class Write:
+    """One number of a world's model: ``base + gain * param``, or ``base + gain / param`` where ``inverse`` is 1."""
+
+    param: wp.array[wp.float32]
+    float32: wp.array2d[wp.float32]  # the field (N, size), in the engine's precision; the other one is empty
+    float64: wp.array2d[wp.float64]
+    place: int
+    base: float
+    gain: float
+    inverse: int
+
+
+@wp.kernel
+def _write_fields(mask: wp.array[wp.bool], writes: wp.array[Write]):
+    """Give the parameters of one masked world to its model."""
+    world = wp.tid()
+    if not mask[world]:
+        return
+    for i in range(writes.shape[0]):
+        write = writes[i]
+        param = write.param[world]
+        if write.inverse == 1:
+            param = 1.0 / param
+        value = write.base + write.gain * param
+        if write.float32.shape[0] > 0:
+            write.float32[world, write.place] = value
+        else:
+            write.float64[world, write.place] = wp.float64(value)
+
+
+class Change(NamedTuple):
+    """A part of a field, and what it must hold."""
+
+    field: str
+    where: tuple[int | slice, ...]  # in one world's array
+    param: Tensor  # (N,), or (N, size) with one column for each number
+    base: ArrayLike  # base and gain, to the shape of that part
+    gain: ArrayLike
+    inverse: bool = False
+
+
+class ModelFields:
+    """Writes the model fields that follow ``params``.
+
+    Args:
+        model: the nominal robot.
+        params: parameters of N worlds, edited in place.
+        fields: name of :data:`NAMES` -> (N, ...) float32 or float64: the fields of N models.
+    """
+
+    NAMES = (
+        "pair_friction",
+        "body_mass",
+        "body_subtreemass",
+        "body_inertia",
+        "body_ipos",
+        "actuator_gainprm",
+        "actuator_biasprm",
+        "actuator_forcerange",
+        "dof_armature",
+    )
+
+    def __init__(self, model: mujoco.MjModel, params: EngineParams, fields: Mapping[str, Tensor]) -> None:
+        count, device = params.friction.shape[0], params.friction.device
+        self._params, self._fields = params, fields  # the kernel knows the tensors by address alone
+        self._mask = torch.zeros(count, dtype=torch.bool, device=device)
+        changes = [*_body(model, params), *_motors(model, params)]
+        writes = [write for change in changes for write in _writes(change, fields[change.field])]
+        table = wp.array(writes, dtype=Write, device=wp.device_from_torch(device))
+        self._write = record(_write_fields, count, [share(self._mask), table], device)
+
+    def write(self, mask: Tensor) -> None:
+        """Give the parameters of the worlds of ``mask`` (N,) bool to their models."""
+        self._mask.copy_(mask)
+        self._write()
+
+
+def _body(model: mujoco.MjModel, params: EngineParams) -> Iterator[Change]:
+    """Friction, and the trunk with what is bolted to it; its inertia grows in proportion to its mass."""
+    trunk = int(model.body(TRUNK_BODY).id)
+    mass, inertia = model.body_mass[trunk], model.body_inertia[trunk]
+    yield Change("pair_friction", (slice(None), slice(2)), params.friction, 0.0, 1.0)  # both directions
+    yield Change("body_mass", (trunk,), params.trunk_mass, mass, 1.0)
+    for body in (0, trunk):
+        yield Change("body_subtreemass", (body,), params.trunk_mass, model.body_subtreemass[body], 1.0)
+    yield Change("body_inertia", (trunk,), params.trunk_mass, inertia, inertia / mass)
+    yield Change("body_ipos", (trunk,), params.trunk_com, model.body_ipos[trunk], 1.0)
+
+
+def _motors(model: mujoco.MjModel, params: EngineParams) -> Iterator[Change]:
+    """What set_to_dcmotor and set_to_position of :mod:`pace.sim.robot` write."""
+    every, gains = slice(None), model.actuator_gainprm
+    if bool((model.actuator_gaintype == mujoco.mjtGain.mjGAIN_DCMOTOR).all()):
+        resistance, kp, kd = gains[:, 0], gains[:, 4], gains[:, 6]
+        yield Change("actuator_gainprm", (every, 0), params.effort_scale, 0.0, resistance, inverse=True)
+        yield Change("actuator_gainprm", (every, 4), params.kp_scale, 0.0, kp)
+        yield Change("actuator_gainprm", (every, 6), params.kd_scale, 0.0, kd)
+    else:
+        kp, kd = gains[:, 0], -model.actuator_biasprm[:, 2]
+        yield Change("actuator_gainprm", (every, 0), params.kp_scale, 0.0, kp)
+        yield Change("actuator_biasprm", (every, 1), params.kp_scale, 0.0, -kp)
+        yield Change("actuator_biasprm", (every, 2), params.kd_scale, 0.0, -kd)
+    yield Change("actuator_forcerange", (every,), params.effort_scale, 0.0, model.actuator_forcerange)
+    yield Change("dof_armature", (slice(6, None),), params.armature_scale, 0.0, model.dof_armature[6:])
+
+
+def _writes(change: Change, field: Tensor) -> Iterator[Write]:
+    """One for each number that changes."""
+    flat = field.view(field.shape[0], -1)
+    places = np.arange(flat.shape[1]).reshape(field.shape[1:])[change.where]
+    bases, gains = (np.broadcast_to(np.asarray(values), places.shape).ravel() for values in (change.base, change.gain))
+    params = change.param.view(flat.shape[0], -1).expand(-1, places.size).unbind(1)
+    for param, place, base, gain in zip(params, places.ravel().tolist(), bases, gains, strict=True):
+        write = Write()
+        write.param, write.place, write.base, write.gain = share(param), place, float(base), float(gain)
+        write.inverse = int(change.inverse)
+        setattr(write, str(field.dtype).removeprefix("torch."), wp.from_torch(flat))
+        yield write

@@ -1,0 +1,97 @@
+"""The native engine: MuJoCo C on all CPU cores, through MuJoCo's own batch of simulations."""
+
+from __future__ import annotations
+
+import copy
+import ctypes
+from contextlib import suppress
+
+import mujoco
+import numpy as np
+import torch
+from mujoco import _batch
+from mujoco.batch import Batch
+from torch import Tensor
+
+from pace.config.base import ConfigError
+from pace.config.sim import EngineConfig
+from pace.devices import usable_cores
+from pace.sim.engine.base import StateTensors
+from pace.sim.engine.model_fields import ModelFields
+
+_CONTROL = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
+
+
+class NativeEngine(StateTensors):
+    """MuJoCo C in float64. ``mujoco.batch`` keeps a pool of threads, the warm start and each world's model fields.
+
+    See :class:`~pace.sim.engine.base.RobotEngine`. Work on the host in proportion to the worlds concerned is allowed
+    here.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, engine: EngineConfig, num_worlds: int, device: torch.device, substeps: int
+    ) -> None:
+        if device.type != "cpu":
+            raise ConfigError(f"engine native runs on the CPU, not on {device}: use device=cpu or engine=mjwarp")
+        super().__init__(model, num_worlds, device, substeps, engine.physics_dt)
+        stop_timers()
+        model = copy.copy(model)
+        # a state that is not finite stays so and is seen; MuJoCo would put that robot back on its feet without a word
+        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        self._batch = batch = Batch(model, num_worlds, engine.threads or usable_cores())
+        fields = {name: torch.from_numpy(batch.expand(name)) for name in ModelFields.NAMES}
+        self._fields = ModelFields(model, self.params, fields)
+        self._qpos, self._qvel = batch.bind("qpos"), batch.bind("qvel")
+        self._warmstart = batch.bind("qacc_warmstart")
+        self._control = np.zeros((num_worlds, substeps, model.nu + model.nv))
+        self._targets, self._applied = self._control[..., : model.nu], self._control[..., model.nu :]
+        widths = {"qpos": model.nq, "qvel": model.nv, "sensordata": model.nsensordata, "actuator_force": model.nu}
+        self._record = {name: np.zeros((num_worlds, substeps, width)) for name, width in widths.items()}
+        self._sensordata = torch.from_numpy(self._record["sensordata"])[:, -1]
+        self._actuator_force = torch.from_numpy(self._record["actuator_force"])[:, -1]
+        # NumPy copies: torch's would wake its own threads beside the pool's, which costs milliseconds on busy cores
+        self._paths = {"qpos": self.qpos_path.numpy(), "qvel": self.qvel_path.numpy()}
+        self._qpos[:] = self._paths["qpos"][:, 0]
+
+    def advance(self, targets: Tensor, applied: Tensor) -> None:
+        self._targets[:] = targets.numpy()
+        self._applied[:] = applied.numpy()[:, None]
+        self._paths["qpos"][:, 0] = self._qpos
+        self._paths["qvel"][:, 0] = self._qvel
+        self._batch.rollout(self.substeps, self._control, _CONTROL, tuple(self._record), out=self._record)
+        for name, path in self._paths.items():
+            path[:, 1:] = self._record[name]
+        self._read_sensors(self._sensordata, self._actuator_force)
+
+    def _solver_state(self) -> tuple[Tensor, Tensor, Tensor]:
+        qpos, qvel, warmstart = (torch.from_numpy(array) for array in (self._qpos, self._qvel, self._warmstart))
+        return qpos, qvel, warmstart
+
+    def apply_params(self, mask: Tensor) -> None:
+        self._fields.write(mask)
+
+    def add_velocity(self, delta: Tensor) -> None:
+        self._qvel += delta.numpy()
+
+    def overflowed(self) -> bool:
+        full = [int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_CNSTRFULL)]
+        return bool(self._batch.warning[:, full, 1].any())  # mjWarningStat: last info, number
+
+    def state_dict(self) -> dict[str, Tensor]:
+        state = {"qpos": self._qpos, "qvel": self._qvel, "warmstart": self._warmstart}
+        return {name: torch.from_numpy(array) for name, array in state.items()} | self._outputs()
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        for name, tensor in self.state_dict().items():
+            tensor.copy_(state[name])
+
+
+def stop_timers() -> None:
+    """Let MuJoCo read no clock in this process: its Python module times every part of every step, 5 % of it.
+
+    ``MjData.timer`` stays zero from then on. A module that does not show its hook keeps its clock.
+    """
+    # mujoco.set_mjcb_time(None) only puts the module's own clock back
+    with suppress(ValueError):
+        ctypes.c_void_p.in_dll(ctypes.CDLL(_batch.__file__), "mjcb_time").value = None

@@ -1,0 +1,106 @@
+"""Where serves and robots start: samplers over N worlds."""
+
+from __future__ import annotations
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from pace.arrays.draws import Column, Draws, columns_of
+from pace.arrays.share import record, share
+from pace.config.sim import RobotConfig
+from pace.config.task import ResetConfig, ServeConfig
+from pace.sim.ball.ball import BallSim
+from pace.sim.robot import RIGHT_ARM
+
+
+@wp.kernel
+def turn(yaw: wp.array[wp.float32], qpos: wp.array2d[wp.float32]):
+    """The quaternion of a robot that stands upright, turned by ``yaw`` rad."""
+    world = wp.tid()
+    qpos[world, 3] = wp.cos(0.5 * yaw[world])
+    qpos[world, 6] = wp.sin(0.5 * yaw[world])
+
+
+class ServeSampler:
+    """Draws where serves start and how fast they are."""
+
+    def __init__(
+        self, config: ServeConfig, num_worlds: int, generator: torch.Generator, device: torch.device | str
+    ) -> None:
+        launch = torch.zeros(num_worlds, 9, device=device)
+        self._launch = launch[:, :3], launch[:, 3:6], launch[:, 6:]
+        ranges = [config.x, config.y, config.z, config.vx, config.vy, config.vz, config.spin, config.spin, config.spin]
+        self._draw = Draws(columns_of(launch, ranges), generator)
+
+    def sample(self, mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Position m, velocity m/s and spin rad/s, each (N, 3), world frame: new in the worlds of ``mask`` (N,) bool.
+
+        The tensors are the same ones each time.
+        """
+        self._draw(mask)
+        return self._launch
+
+
+class HeadStart:
+    """Puts balls that are being served somewhere further on their way, by a time drawn from ``config.head_start``."""
+
+    def __init__(self, config: ServeConfig, ball: BallSim, generator: torch.Generator) -> None:
+        duration = torch.zeros(ball.num_worlds, device=ball.device)
+        self._draw = Draws([Column(duration, *config.head_start)], generator)
+        self._skip = ball.skipper(duration)
+
+    def give(self, mask: Tensor) -> None:
+        """Another time for each world of ``mask`` (N,) bool; its ball moves on by that."""
+        self._draw(mask)
+        self._skip(mask)
+
+
+class PoseSampler:
+    """Draws the state in which a robot starts an episode."""
+
+    def __init__(
+        self,
+        config: ResetConfig,
+        robot: RobotConfig,
+        num_worlds: int,
+        nominal: Tensor,
+        limits: tuple[Tensor, Tensor],
+        joint_names: tuple[str, ...],
+        generator: torch.Generator,
+    ) -> None:
+        device, joints = nominal.device, nominal.shape[0]
+        self._qpos = torch.zeros(num_worlds, 7 + joints, device=device)
+        self._qvel = torch.zeros(num_worlds, 6 + joints, device=device)
+        self._qpos[:, 2] = robot.base_height
+        yaw = torch.zeros(num_worlds, device=device)
+        columns = columns_of(self._qpos[:, :2], [config.base_x, config.base_y])
+        columns.append(Column(yaw, *config.yaw))
+        rates = [config.roll_pitch_rate, config.roll_pitch_rate, config.yaw_rate]
+        columns += columns_of(self._qvel[:, :6], [*[config.linear_velocity] * 3, *rates])
+        ends = zip(*(limit.tolist() for limit in limits), strict=True)
+        ranges = _joint_ranges(config, joint_names, nominal.tolist())
+        columns += columns_of(self._qpos[:, 7:], [(*pair, *end) for pair, end in zip(ranges, ends, strict=True)])
+        self._draw = Draws(columns, generator)
+        self._turn = record(turn, num_worlds, [share(yaw), wp.from_torch(self._qpos)], device)
+
+    def sample(self, mask: Tensor) -> tuple[Tensor, Tensor]:
+        """qpos (N, 7 + J) and qvel (N, 6 + J) of MuJoCo; joints within their limits and at rest.
+
+        New in the worlds of ``mask`` (N,) bool; the tensors are the same ones each time.
+        """
+        self._draw(mask)
+        self._turn()
+        return self._qpos, self._qvel
+
+
+def _joint_ranges(config: ResetConfig, names: tuple[str, ...], nominal: list[float]) -> list[tuple[float, float]]:
+    """Lowest and highest angle of each joint at the start of an episode, rad."""
+    ranges = []
+    for name, angle in zip(names, nominal, strict=True):
+        if name in RIGHT_ARM:
+            low, high = (angle + end for end in config.right_arm_offset)
+        else:
+            low, high = (angle * end for end in config.joint_scale)
+        ranges.append((low, high))
+    return ranges

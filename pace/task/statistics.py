@@ -1,0 +1,91 @@
+"""Counts of what happened in N worlds, summed on the device until somebody asks."""
+
+from __future__ import annotations
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from pace.arrays.share import record, share
+from pace.task.game import Game, Outcome
+
+#: Outcomes that serves are counted by; ``outcome/success`` and the others add up to ``serves``.
+COUNTED = tuple(outcome for outcome in Outcome if outcome not in (Outcome.OPEN, Outcome.BAD_SERVE))
+NAMES = (
+    "serves",
+    "hits",
+    "rim_hits",
+    "successes",
+    "bad_serves",
+    "falls",
+    "episodes",
+    "steps",
+    *(f"outcome/{outcome.name.lower()}" for outcome in COUNTED),
+)
+
+SERVES, HITS, RIM_HITS, SUCCESSES, BAD_SERVES, FALLS, EPISODES, STEPS = (wp.constant(i) for i in range(8))
+#: Outcomes have their columns in the order of their codes, the first of which is 1.
+OUTCOMES = wp.constant(len(NAMES) - len(COUNTED) - 1)
+SUCCESS, BAD_SERVE = wp.constant(int(Outcome.SUCCESS)), wp.constant(int(Outcome.BAD_SERVE))
+
+
+@wp.kernel
+def _count(
+    over: wp.array[wp.bool],
+    outcome: wp.array[wp.int32],
+    hit: wp.array[wp.bool],
+    rim: wp.array[wp.bool],
+    lost: wp.array[wp.bool],
+    truncated: wp.array[wp.bool],
+    played: wp.array[wp.float32],
+    first_counted: wp.array[wp.float32],
+    sums: wp.array[wp.float32],
+):
+    """Count one world's step. The sums are whole numbers, so the order in which worlds add to them does not matter."""
+    world = wp.tid()
+    if world == 0:
+        wp.atomic_add(sums, STEPS, float(over.shape[0]))
+    if lost[world]:
+        wp.atomic_add(sums, FALLS, 1.0)
+    if lost[world] or truncated[world]:
+        wp.atomic_add(sums, EPISODES, 1.0)
+    if not over[world] or played[world] < first_counted[0]:
+        return
+    if outcome[world] == BAD_SERVE:
+        wp.atomic_add(sums, BAD_SERVES, 1.0)
+        return
+    wp.atomic_add(sums, SERVES, 1.0)
+    wp.atomic_add(sums, OUTCOMES + outcome[world], 1.0)
+    if outcome[world] == SUCCESS:
+        wp.atomic_add(sums, SUCCESSES, 1.0)
+    if hit[world]:
+        wp.atomic_add(sums, HITS, 1.0)
+        if rim[world]:
+            wp.atomic_add(sums, RIM_HITS, 1.0)
+
+
+class Statistics:
+    """Sums over worlds and control steps since the last :meth:`pop`.
+
+    ``serves`` that ended, without ``bad_serves``; ``hits``, ``rim_hits`` and ``successes`` among them; their
+    ``outcome/<name>``; ``falls`` (or area left), ``episodes`` that ended, ``steps`` of all worlds. Serves are counted
+    at their end, and not while a world plays its first ``env.warmup_serves``.
+    """
+
+    def __init__(self, game: Game, first_counted: Tensor) -> None:
+        """Of ``game``, where a world's serves count from number ``first_counted`` (0-d) on."""
+        ends, played = game.ends, game.clock.played
+        self.sums = torch.zeros(len(NAMES), device=played.device)
+        tensors = (ends.over, ends.outcome, game.referee.hit, game.referee.rim, ends.lost, ends.truncated, played)
+        inputs = [share(tensor) for tensor in (*tensors, first_counted.view(1), self.sums)]
+        self._count = record(_count, len(played), inputs, played.device)
+
+    def add(self) -> None:
+        """Count the control step that was just judged, before the clock counts its serves."""
+        self._count()
+
+    def pop(self) -> dict[str, Tensor]:
+        """The sums by name, as 0-d tensors; starts anew."""
+        popped = dict(zip(NAMES, self.sums.clone().unbind(), strict=True))
+        self.sums.zero_()
+        return popped

@@ -1,0 +1,75 @@
+"""The film of :mod:`pace.viewer`: the scene from the side and from the top, with the same marks as the page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from itertools import chain
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from pace.sim.render import Picture, RenderError, SceneRenderer, caption, top_camera
+from pace.sim.robot import build_model
+from pace.viewer.playback import Show
+
+TOP = (-0.75, 0.0, 4.2)  # m: x, y and height of the camera
+BLOCK = 2  # pixels: the codec halves the colours' resolution
+
+
+def side_camera() -> mujoco.MjvCamera:
+    """From the robot's right, robot and table in view."""
+    camera = mujoco.MjvCamera()
+    camera.lookat[:] = (-0.7, 0.0, 0.75)
+    camera.distance, camera.azimuth, camera.elevation = 4.2, 90.0, -10.0
+    return camera
+
+
+def pictures(show: Show, seconds: float, fps: int, speed: float, width: int, height: int) -> Iterator[Picture]:
+    """``seconds`` of play at ``fps`` pictures a second of film, time slowed by ``speed``: uint8 (2 height, width, 3).
+
+    Errors: :class:`pace.sim.render.RenderError` where there is no OpenGL.
+    """
+    config = show.env.config
+    model = build_model(config.robot, config.engine, config.ball.table, visual=True)
+    with SceneRenderer(model, width, height) as renderer:
+        for _ in range(max(1, round(seconds * fps / speed))):
+            snapshot = show.advance(speed / fps)
+            renderer.set_state(snapshot.qpos, snapshot.ball)
+            views = [renderer.draw(camera, snapshot.marks()) for camera in (side_camera(), top_camera(*TOP))]
+            yield caption(np.concatenate(views), show.score.text().replace(" | ", "\n"))
+
+
+def write_video(
+    file: Path,
+    show: Show,
+    seconds: float,
+    fps: int,
+    speed: float,
+    width: int,
+    height: int,
+    on_picture: Callable[[], None] = lambda: None,
+) -> None:
+    """Write a film as H.264.
+
+    Errors: :class:`pace.sim.render.RenderError` where OpenGL or a package is missing, or the file cannot be written.
+    """
+    try:
+        import imageio_ffmpeg
+    except ImportError as error:
+        raise RenderError(f"{error}: pip install 'pace-table-tennis[viewer]'") from error
+    film = pictures(show, seconds, fps, speed, width, height)
+    first = next(film)  # before the file is made: without OpenGL there is none
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.touch()  # the encoder would only report a broken pipe
+        writer = imageio_ffmpeg.write_frames(
+            str(file), (width, 2 * height), fps=fps, codec="libx264", quality=7, macro_block_size=BLOCK
+        )
+        writer.send(None)
+        for picture in chain([first], film):
+            writer.send(np.ascontiguousarray(picture))
+            on_picture()
+        writer.close()
+    except OSError as error:
+        raise RenderError(f"{file} cannot be written: {str(error).strip().splitlines()[0]}") from error

@@ -1,0 +1,293 @@
+"""The live page of :mod:`pace.viewer`: the scene in a browser, with controls. Needs the extra ``viewer``.
+
+The browser's events arrive on threads of the server; they only put requests into a queue, which the one loop that
+plays and draws works off.
+"""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Callable, Sequence
+from contextlib import redirect_stdout
+from io import StringIO
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from pace.config.base import ConfigError
+from pace.rl.policies import TaskPolicy, load_policy
+from pace.runs.checkpoint import FOLDER, CheckpointError, list_checkpoints
+from pace.sim.render import Colour
+from pace.sim.robot import build_model
+from pace.viewer.playback import (
+    APEX_COLOUR,
+    APEX_RADIUS,
+    BASE_COLOUR,
+    BASE_RADIUS,
+    FLIGHT_COLOUR,
+    FLIGHT_WIDTH,
+    PREDICTION_COLOUR,
+    PREDICTION_RADIUS,
+    Serve,
+    Show,
+    Snapshot,
+)
+
+FRAME = 1.0 / 30.0  # s between pictures
+LONGEST_FRAME = 0.1  # s: a page that was held up does not make up for it
+IDLE = 0.1  # s between looks whether somebody has come
+LOOK_FOR_CHECKPOINTS = 5.0  # s: a training run may write new ones
+CAMERA, LOOK_AT = (-2.9, -2.6, 1.7), (-0.7, 0.0, 0.8)  # m, where a browser starts
+#: Sliders of a serve: label, least, largest, step, start, hint. In the order of :class:`Serve`.
+SERVE_SLIDERS = (
+    ("Speed (m/s)", 4.5, 7.5, 0.05, 5.8, "over the ground"),
+    ("Direction (°)", -10.0, 10.0, 0.1, -1.0, "to the robot's left"),
+    ("Upward (m/s)", 1.0, 3.0, 0.05, 1.75, "at the start"),
+    ("Topspin (rad/s)", -150.0, 150.0, 5.0, 0.0, "acts at every bounce, and in the air with the ball venue"),
+    ("Sidespin (rad/s)", -150.0, 150.0, 5.0, 0.0, "to the robot's left when positive"),
+)
+LEGEND = (
+    "Green: apex of the flight. Yellow: the predictor's. Blue: where the base should stand. Line: the flight ahead."
+)
+
+
+class PageError(RuntimeError):
+    """A page that cannot be shown; the message says why."""
+
+
+def require_viewer() -> None:
+    """Errors: :class:`PageError` where the packages of the page are missing."""
+    try:
+        import mjviser
+    except ImportError as error:
+        raise PageError(f"{error}: pip install 'pace-table-tennis[viewer]'") from error
+    del mjviser
+
+
+def require_port(host: str, port: int) -> None:
+    """Errors: :class:`PageError` when ``port`` of ``host`` is taken, or not ours to open."""
+    try:
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+        socket.create_server((host, port), family=family).close()
+    except (OSError, OverflowError) as error:
+        raise PageError(
+            f"port {port} of {host} cannot be opened ({error}): give another port=, or end what uses it"
+        ) from error
+
+
+def checkpoints_of(policy: TaskPolicy) -> list[Path]:
+    """All checkpoints of the run that ``policy`` comes from, newest last; at least its own."""
+    own = Path(policy.source)
+    return list_checkpoints(own.parent.parent) if own.parent.name == FOLDER else [own]
+
+
+class Page:
+    """Plays a policy in the browsers that look at it, at real time or slower.
+
+    Attributes: ``show``, ``server`` (viser), ``url``.
+
+    Args:
+        policy: as :func:`pace.rl.load_policy` gives it.
+        overrides: of the saved task.
+        balls: names of ball presets to choose from.
+        host, port: where to listen. A host other than the local one lets everybody in reach watch and press buttons.
+        speed: of time, 1 for real time.
+        seed: of all draws.
+
+    Errors: :class:`PageError`; :class:`pace.config.ConfigError` for wrong overrides.
+    """
+
+    def __init__(
+        self,
+        policy: TaskPolicy,
+        overrides: Sequence[str],
+        balls: Sequence[str],
+        host: str = "127.0.0.1",
+        port: int = 8080,
+        speed: float = 1.0,
+        seed: int = 1,
+    ) -> None:
+        require_viewer()
+        require_port(host, port)
+        import viser
+
+        self._overrides, self._seed = list(overrides), seed
+        self._ball: str | None = None  # that of the overrides, or of the saved task
+        self._policy = policy
+        self._requests: SimpleQueue[Callable[[], None]] = SimpleQueue()
+        self.show = Show(policy, overrides, seed)
+        with redirect_stdout(StringIO()):  # its own banner
+            self.server = viser.ViserServer(host=host, port=port, label="PACE", verbose=False)
+        if self.server.get_port() != port:  # somebody was quicker
+            self.server.stop()
+            raise PageError(f"port {port} of {host} was taken just now: give another port=")
+        self.url = f"http://{host}:{port}"
+        self._build_scene()
+        self._build_controls(balls, speed)
+        self._drawn_flight = 0
+        self._next_look = 0.0
+
+    # --- what is to be seen -------------------------------------------------------------------------------------------
+
+    def _build_scene(self) -> None:
+        from mjviser import ViserMujocoScene
+
+        config = self.show.env.config
+        model = build_model(config.robot, config.engine, config.ball.table, visual=True)
+        self._data = mujoco.MjData(model)
+        self._scene = ViserMujocoScene(self.server, model, num_envs=1)
+        self._scene.camera_tracking_enabled = False  # the marks are in the world's frame
+        self.server.initial_camera.position, self.server.initial_camera.look_at = CAMERA, LOOK_AT
+        self._marks = {
+            "apex": self._mark("apex", APEX_RADIUS, APEX_COLOUR),
+            "prediction": self._mark("prediction", PREDICTION_RADIUS, PREDICTION_COLOUR),
+            "base_target": self._mark("base_target", BASE_RADIUS, BASE_COLOUR),
+        }
+
+    def _mark(self, name: str, radius: float, colour: Colour) -> Any:
+        return self.server.scene.add_icosphere(f"/marks/{name}", radius, _rgb(colour), cast_shadow=False)
+
+    def draw(self, snapshot: Snapshot) -> None:
+        """Send what has changed to the browsers."""
+        self._data.qpos[:] = snapshot.qpos
+        self._data.mocap_pos[0] = snapshot.ball
+        mujoco.mj_kinematics(self._scene.mj_model, self._data)
+        with self.server.atomic():
+            for name, handle in self._marks.items():
+                place = getattr(snapshot, name)
+                handle.visible = place is not None
+                if place is not None:
+                    handle.position = place
+            if snapshot.flight_number != self._drawn_flight:
+                self._drawn_flight = snapshot.flight_number
+                self._draw_flight(snapshot)
+            self._scene.update_from_mjdata(self._data)
+        self._say(self.show.score.text())
+
+    def _draw_flight(self, snapshot: Snapshot) -> None:
+        pieces = np.stack((snapshot.flight[:-1], snapshot.flight[1:]), axis=1)
+        look = {"thickness": FLIGHT_WIDTH, "thickness_units": "screen"}
+        self.server.scene.add_line_segments("/marks/flight", pieces, _rgb(FLIGHT_COLOUR), **look)
+
+    def _say(self, text: str) -> None:
+        if self._score.content != text:
+            self._score.content = text
+
+    # --- controls -----------------------------------------------------------------------------------------------------
+
+    def _build_controls(self, balls: Sequence[str], speed: float) -> None:
+        gui = self.server.gui
+        gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
+        gui.main_panel.dock_right()
+        self._score = gui.add_markdown(self.show.score.text())
+        next_serve = gui.add_button("Next serve")
+        next_serve.on_click(lambda _: self._ask(lambda: self.show.next_serve(self.serve)))
+        ball = gui.add_button_group("Ball", tuple(balls))
+        ball.on_click(lambda _: self._ask(lambda: self._change_ball(ball.value)))
+        self._time = gui.add_slider("Speed of time", min=0.05, max=1.0, step=0.05, initial_value=speed)
+        self._build_serve()
+        self._checkpoint = gui.add_dropdown("Checkpoint", self._names(), initial_value=Path(self._policy.source).name)
+        self._checkpoint.on_update(lambda _: self._ask(lambda: self._change_checkpoint(self._checkpoint.value)))
+        self._status = gui.add_markdown(self._describe())
+        gui.add_markdown(LEGEND)
+
+    def _build_serve(self) -> None:
+        gui = self.server.gui
+        with gui.add_folder("Serve"):
+            self._random = gui.add_checkbox("Random, as in the paper's evaluation", initial_value=True)
+            self._random.on_update(lambda _: self._ask(lambda: self.show.choose(self.serve)))
+            self._sliders = []
+            for label, least, largest, step, start, hint in SERVE_SLIDERS:
+                slider = gui.add_slider(label, min=least, max=largest, step=step, initial_value=start, hint=hint)
+                slider.on_update(lambda _: self._ask(self._take_sliders))
+                self._sliders.append(slider)
+
+    def _take_sliders(self) -> None:
+        self._random.value = False
+        self.show.choose(self.serve)
+
+    @property
+    def serve(self) -> Serve | None:
+        """What the sliders say, or ``None`` for random serves."""
+        return None if self._random.value else Serve(*(float(slider.value) for slider in self._sliders))
+
+    def _ask(self, request: Callable[[], None]) -> None:
+        self._requests.put(request)
+
+    def _describe(self) -> str:
+        config, policy = self.show.env.config, self._policy
+        samples = policy.counters.get("samples", 0.0)
+        return f"{Path(policy.source).name}, {samples / 1e6:.1f} M samples; ball {config.ball.name}"
+
+    # --- changes ------------------------------------------------------------------------------------------------------
+
+    def _names(self) -> tuple[str, ...]:
+        return tuple(folder.name for folder in reversed(checkpoints_of(self._policy)))
+
+    def _change_ball(self, name: str) -> None:
+        self._restart(self._policy, name)
+
+    def _change_checkpoint(self, name: str) -> None:
+        if name == Path(self._policy.source).name:
+            return
+        try:
+            policy = load_policy(Path(self._policy.source).with_name(name))
+        except CheckpointError as error:  # the training run may have deleted it
+            self._status.content = f"**{error}**"
+            return
+        self._restart(policy, self._ball)
+
+    def _restart(self, policy: TaskPolicy, ball: str | None) -> None:
+        """Another policy or another ball: a new show, with a new score."""
+        chosen = [f"ball={ball}"] if ball else []
+        try:
+            self.show = Show(policy, [*self._overrides, *chosen], self._seed)
+        except ConfigError as error:
+            self._status.content = f"**{error}**"
+            return
+        self._policy, self._ball = policy, ball
+        self.show.choose(self.serve)
+        self._drawn_flight = 0
+        self._status.content = self._describe()
+
+    def _look_for_checkpoints(self) -> None:
+        if time.monotonic() >= self._next_look:
+            self._next_look = time.monotonic() + LOOK_FOR_CHECKPOINTS
+            names = self._names()
+            if names and names != tuple(self._checkpoint.options) and self._checkpoint.value in names:
+                self._checkpoint.options = names
+
+    # --- the loop -----------------------------------------------------------------------------------------------------
+
+    def run(self, ended: Callable[[], bool] = lambda: False) -> None:
+        """Play while somebody looks, until ``ended`` or Ctrl-C; then close the server."""
+        try:
+            before = time.monotonic()
+            while not ended():
+                now = time.monotonic()
+                self._step(min(now - before, LONGEST_FRAME))
+                before = now
+                time.sleep(max(0.0, FRAME - (time.monotonic() - now)))
+        finally:
+            self.server.stop()
+
+    def _step(self, elapsed: float) -> None:
+        while True:
+            try:
+                self._requests.get_nowait()()
+            except Empty:
+                break
+        self._look_for_checkpoints()
+        if self.server.get_clients():
+            self.draw(self.show.advance(elapsed * self._time.value))
+        else:
+            time.sleep(IDLE)
+
+
+def _rgb(colour: Colour) -> tuple[int, int, int]:
+    red, green, blue, _ = (round(255 * part) for part in colour)
+    return red, green, blue

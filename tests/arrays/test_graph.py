@@ -1,0 +1,180 @@
+"""A step and a reset as graphs do what they do without: on a CPU with the graph emulated, on a GPU with CUDA's."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+import warp as wp
+from torch import Tensor
+
+from pace.arrays.graph import CapturedCall
+from pace.arrays.share import record
+from pace.config.base import ConfigError
+from pace.predictor.network import PredictorNetwork
+from pace.task.env import TableTennisEnv
+from tests.helpers.emulation import Recording, take_the_gpus_way
+from tests.helpers.fakes import config
+
+N, STEPS = 4, 50
+PUSHED = (
+    "engine=mjwarp",
+    "randomization.push_interval=[0.02,0.04]",
+    "serve.serves_per_episode=2",
+    "serve.max_duration=0.2",
+)
+
+
+def make(device: str = "cpu", *overrides: str) -> TableTennisEnv:
+    """An environment with a predictor, pushes and short episodes; the same each time."""
+    settings = config(*PUSHED, *overrides)
+    torch.manual_seed(0)
+    return TableTennisEnv(settings, N, device, 1, PredictorNetwork(settings.predictor).to(device))
+
+
+@pytest.fixture
+def emulated(monkeypatch: pytest.MonkeyPatch) -> list[Recording]:
+    """Calls are captured on the CPU; the list of the recordings made."""
+    made: list[Recording] = []
+
+    def capture(self: CapturedCall, inputs: tuple[Tensor, ...]) -> Recording:
+        made.append(Recording(self._function, inputs))
+        return made[-1]
+
+    monkeypatch.setattr(CapturedCall, "_capture", capture)
+    return made
+
+
+def captured(function: Any) -> CapturedCall:
+    """A call whose graph is emulated."""
+    return CapturedCall(function, torch.device("cpu"), enabled=True)
+
+
+def test_a_call_is_replayed_with_new_arguments_and_new_random_draws(emulated: list[Recording]) -> None:
+    total, drawn, calls = torch.zeros(3), torch.zeros(3), []
+    generator = torch.Generator().manual_seed(3)
+    expected = torch.rand(4, 3, generator=torch.Generator().manual_seed(3))
+
+    def function(value: Tensor) -> None:
+        calls.append(None)
+        drawn.copy_(torch.rand(3, generator=generator))
+        total[1:] += (2.0 * value)[1:]
+
+    call = captured(function)
+    for k in range(4):
+        call(torch.full((3,), float(k)))
+        torch.testing.assert_close(drawn, expected[k], rtol=0, atol=0)
+    assert total.tolist() == [0.0, 12.0, 12.0]  # 2 (0 + 1 + 2 + 3)
+    assert len(calls) == 2  # as it is, and to be captured
+    assert len(emulated) == 1
+
+
+def test_a_number_that_python_counts_stands_still_in_a_graph(emulated: list[Recording]) -> None:
+    """What the comparison below would find."""
+    seen, count = torch.zeros(()), [0]
+
+    def function() -> None:
+        count[0] += 1
+        seen.fill_(count[0])
+
+    call = captured(function)
+    values = [(call(), float(seen))[1] for _ in range(4)]
+    assert values == [1.0, 2.0, 2.0, 2.0]
+
+
+def test_a_call_within_another_is_part_of_it(emulated: list[Recording]) -> None:
+    count = torch.zeros(())
+    inner = captured(lambda: count.add_(1.0))
+    outer = captured(lambda: inner())
+    for _ in range(5):
+        outer()
+    assert count == 5.0
+    assert len(emulated) == 1
+
+
+def play(env: TableTennisEnv, steps: int = STEPS) -> list[dict[str, Any]]:
+    """States after each of some steps under random actions, some worlds being reset besides those that are done."""
+    generator, states = torch.Generator().manual_seed(0), []
+    for _ in range(steps):
+        action = 0.5 * torch.randn(N, 21, generator=generator)
+        extra = torch.rand(N, generator=generator) < 0.05
+        env.advance(action.to(env.worlds.nominal.device))
+        env.reset_worlds(env.terminated | env.truncated | extra.to(env.terminated.device))
+        states.append(env.state_dict())
+    return states
+
+
+def test_replayed_steps_and_resets_equal_those_without_a_graph(emulated: list[Recording]) -> None:
+    """Bit for bit, though a replay has nothing but the operators, numbers and addresses of the second call."""
+    plain, graphed = make(), make()
+    for env in (plain, graphed):
+        take_the_gpus_way(env)
+    for call in (graphed._step_in_place, graphed._reset_in_place):
+        call._enabled = True
+    graphed._reset_in_place._inputs = (torch.zeros(N, dtype=torch.bool),)  # its first call has been the constructor's
+    expected, states = play(plain, 5), play(graphed, 5)
+    for env in (plain, graphed):
+        env.warmup_serves = 2
+    expected, states = expected + play(plain), states + play(graphed)
+    assert len(emulated) == 2  # the step with the engine's part in it, and the reset
+    for step, (state, other) in enumerate(zip(states, expected, strict=True)):
+        for name, value in other.items():
+            torch.testing.assert_close(
+                state[name], value, rtol=0, atol=0, equal_nan=True, msg=lambda text, k=step, n=name: f"{n}, {k}: {text}"
+            )
+    statistics, same = graphed.pop_statistics(), plain.pop_statistics()
+    assert statistics == same
+    assert min(statistics["episodes"], statistics["serves"]) > 0
+    assert statistics["steps"] == N * (STEPS + 5)
+
+
+def test_graphs_need_a_gpu() -> None:
+    with pytest.raises(ConfigError, match=r"engine\.graph=always needs a GPU, and the device is cpu"):
+        make("cpu", "engine.graph=always")
+    with pytest.raises(ConfigError, match=r"engine\.graph must be auto, always or never, not 'on'"):
+        config("engine.graph='on'")
+
+
+@wp.kernel
+def _add(values: wp.array[float], total: wp.array[float]):
+    total[wp.tid()] += values[wp.tid()]
+
+
+needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="captures CUDA graphs")
+
+
+@needs_gpu
+def test_a_cuda_graph_holds_torchs_and_warps_work() -> None:
+    device = torch.device("cuda:0")
+    generator, same = (torch.Generator(device).manual_seed(3) for _ in range(2))
+    drawn, total = torch.zeros(8, device=device), torch.zeros(8, device=device)
+    add = record(_add, 8, [wp.from_torch(drawn), wp.from_torch(total)], device)
+
+    def function(scale: Tensor) -> None:
+        drawn.copy_(scale * torch.rand(8, device=device, generator=generator))
+        add()
+
+    call = CapturedCall(function, device, True, generator)
+    expected = torch.zeros(8, device=device)
+    for k in range(6):
+        call(torch.full((8,), float(k), device=device))
+        expected += float(k) * torch.rand(8, device=device, generator=same)
+    assert isinstance(call._graph, torch.cuda.CUDAGraph)
+    torch.testing.assert_close(total, expected)
+    assert torch.equal(generator.get_state(), same.get_state())
+
+
+@needs_gpu
+def test_cuda_graphs_of_step_and_reset_do_what_the_calls_do() -> None:
+    """The draws are the same to the bit; motion up to what MuJoCo Warp's order of summation on a GPU leaves open."""
+    plain, graphed = make("cuda", "engine.graph=never"), make("cuda", "engine.graph=always")
+    expected, states = play(plain), play(graphed)
+    for call in (graphed._step_in_place, graphed._reset_in_place):
+        assert isinstance(call._graph, torch.cuda.CUDAGraph)
+    for state, other in zip(states, expected, strict=True):
+        assert torch.equal(state["generator"], other["generator"])
+    for name in ("policy.observation", "rewards.reward", "worlds.position", "worlds.drawn.actuator_delay"):
+        first, second = (torch.stack([state[name] for state in played[:10]]) for played in (states, expected))
+        assert (first - second).abs().median() < 1e-3
+    assert not graphed.worlds.engine.overflowed()

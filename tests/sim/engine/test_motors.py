@@ -1,0 +1,151 @@
+"""The motors' torque in closed form, in both engines: a PD law, a line over speed, and a cap."""
+
+import dataclasses
+import math
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from pace.config.base import ConfigError, parse, to_dict
+from pace.config.training import load_train_config
+from pace.sim.engine.factory import make_engine
+from pace.sim.robot import JOINT_NAMES, build_model, joint_gains, motor_lines
+
+CONFIG = load_train_config()
+WORLDS = 8
+EVERY = torch.ones(WORLDS, dtype=torch.bool)
+KP, KD, EFFORT = joint_gains(CONFIG.robot)
+LINES = motor_lines(CONFIG.robot)
+assert LINES is not None
+SPEED, STALL = LINES
+Factor = float | np.ndarray  # of all worlds, or (N, 1)
+#: Of 18 N m, light enough to reach its greatest speed within its range.
+JOINT = JOINT_NAMES.index("Right_Elbow_Yaw")
+
+
+def make(name, physics_dt=0.002, stall_ratio=2.0):
+    """An engine of one physics step a control step, and its model."""
+    engine = dataclasses.replace(CONFIG.engine, name=name, physics_dt=physics_dt, threads=1)
+    model = build_model(dataclasses.replace(CONFIG.robot, stall_ratio=stall_ratio), engine, CONFIG.ball.table)
+    return make_engine(model, engine, WORLDS, "cpu", 1), model
+
+
+@pytest.fixture(scope="module", params=["native", "mjwarp"])
+def built(request):
+    return make(request.param)
+
+
+def torques(built, offset, speed):
+    """What the motors give at ``speed`` (N, 21) rad/s, ``offset`` (N, 21) rad before their targets."""
+    engine, model = built
+    qpos = torch.as_tensor(model.key_qpos, dtype=torch.float32).repeat(WORLDS, 1)
+    qpos[:, 2] += 1.0
+    qvel = torch.zeros(WORLDS, 27)
+    qvel[:, 6:] = speed
+    engine.reset(EVERY, qpos, qvel)
+    engine.advance((qpos[:, 7:] + offset).unsqueeze(1), torch.zeros(WORLDS, 27))
+    return engine.joint_torque.double().numpy()
+
+
+def law(offset, speed, kp: Factor = 1.0, kd: Factor = 1.0, effort: Factor = 1.0):
+    """PD, within the lines of both directions of voltage, within the effort."""
+    wanted = kp * KP * offset.double().numpy() - kd * KD * speed.double().numpy()
+    back = effort * STALL / SPEED * speed.double().numpy()
+    return np.clip(np.clip(wanted, -effort * STALL - back, effort * STALL - back), -effort * EFFORT, effort * EFFORT)
+
+
+def test_below_the_line_the_torque_is_pd(built):
+    generator = torch.Generator().manual_seed(1)
+    offset, speed = (0.2 * torch.randn(WORLDS, 21, generator=generator) for _ in range(2))
+    expected = KP * offset.double().numpy() - KD * speed.double().numpy()
+    np.testing.assert_allclose(law(offset, speed), np.clip(expected, -EFFORT, EFFORT))
+    assert (np.abs(expected) < EFFORT).mean() > 0.8
+    # the float32 of mjwarp: one part in 10^7 of the joint's angle and of the stall torque
+    np.testing.assert_allclose(torques(built, offset, speed), law(offset, speed), rtol=1e-5, atol=3e-5)
+
+
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+@pytest.mark.parametrize(("share", "of_effort"), [(0.0, 1.0), (0.5, 1.0), (0.75, 0.5), (1.0, 0.0), (1.2, -0.4)])
+def test_drive_falls_with_speed_from_full_effort_at_half_to_zero(built, direction, share, of_effort):
+    speed = direction * share * torch.as_tensor(SPEED, dtype=torch.float32).expand(WORLDS, 21)
+    given = torques(built, torch.full((WORLDS, 21), 50.0 * direction), speed)
+    np.testing.assert_allclose(given, np.tile(direction * of_effort * EFFORT, (WORLDS, 1)), atol=1e-4)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 1.0, 1.2])
+def test_brakes_give_full_effort_at_any_speed(built, share):
+    speed = share * torch.as_tensor(SPEED, dtype=torch.float32).expand(WORLDS, 21)
+    np.testing.assert_allclose(torques(built, torch.full((WORLDS, 21), -50.0), speed), -np.tile(EFFORT, (WORLDS, 1)))
+    damped = torques(built, torch.zeros(WORLDS, 21), speed)  # nothing but kd, up to the effort
+    np.testing.assert_allclose(damped, law(torch.zeros(WORLDS, 21), speed), atol=1e-4)
+    np.testing.assert_allclose(damped, np.maximum(-KD * speed.numpy(), -EFFORT), atol=1e-4)
+
+
+def test_each_world_has_its_own_gains_and_stall_torque(built):
+    engine, _ = built
+    scales = {
+        "kp": torch.linspace(0.8, 1.2, WORLDS),
+        "kd": torch.linspace(1.3, 0.7, WORLDS),
+        "effort": torch.linspace(0.5, 1.0, WORLDS),
+    }
+    for name, values in scales.items():
+        getattr(engine.params, f"{name}_scale").copy_(values)
+    engine.apply_params(EVERY)
+    columns = {name: values.double().view(-1, 1).numpy() for name, values in scales.items()}
+    generator = torch.Generator().manual_seed(2)
+    regimes = {"pd": (0.05, 0.0), "line": (5.0, 0.8), "brake": (-5.0, 0.8)}
+    for reach, share in regimes.values():
+        offset = reach * (1.0 + 0.1 * torch.rand(WORLDS, 21, generator=generator))
+        speed = share * torch.as_tensor(SPEED, dtype=torch.float32).expand(WORLDS, 21)
+        np.testing.assert_allclose(torques(built, offset, speed), law(offset, speed, **columns), atol=2e-4)
+    for name in scales:
+        getattr(engine.params, f"{name}_scale").fill_(1.0)
+    engine.apply_params(EVERY)
+
+
+@pytest.mark.parametrize("physics_dt", [0.002, 0.01])
+@pytest.mark.parametrize("name", ["native", "mjwarp"])
+def test_no_drive_beyond_the_greatest_speed(name, physics_dt):
+    """A far target spins the forearm up to its motor's no-load speed, and past it where the motor knows no speed."""
+    fastest = {}
+    for ratio in (2.0, 0.0):
+        engine, model = make(name, physics_dt, ratio)
+        qpos = torch.as_tensor(model.key_qpos, dtype=torch.float32).repeat(WORLDS, 1)
+        qpos[:, 2] += 1.0
+        qpos[:, 7 + JOINT] = 0.2
+        engine.reset(EVERY, qpos, torch.zeros(WORLDS, 27))
+        targets = qpos[:, 7:].clone()
+        targets[:, JOINT] = 50.0
+        speeds = []
+        while engine.qpos_path[0, -1, 7 + JOINT] < 2.0 and len(speeds) < 1.0 / physics_dt:
+            engine.advance(targets.unsqueeze(1), torch.zeros(WORLDS, 27))
+            speeds.append(float(engine.qvel_path[0, -1, 6 + JOINT]))
+        fastest[ratio] = max(speeds) / SPEED[JOINT]
+    assert 0.9 < fastest[2.0] <= 1.001
+    assert fastest[0.0] > 1.2
+
+
+def test_motors_have_no_state_and_their_order(built):
+    _, model = built
+    assert (model.na, model.nu) == (0, 21)
+    assert (model.actuator_gaintype == mujoco.mjtGain.mjGAIN_DCMOTOR).all()
+    assert (model.actuator_trnid[:, 0] == np.arange(1, 22)).all()
+
+
+def test_without_the_keys_the_motors_are_those_of_before():
+    """As a configuration that was stored before they existed."""
+    robot = to_dict(CONFIG.robot)
+    del robot["stall_ratio"]
+    for group in robot["joint_groups"]:
+        del group["max_speed"]
+    stored = parse(robot, type(CONFIG.robot))
+    assert motor_lines(stored) is None
+    model = build_model(stored, CONFIG.engine, CONFIG.ball.table)
+    assert (model.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED).all()
+    with pytest.raises(ConfigError, match=r"max_speed.*Hip_Pitch"):
+        dataclasses.replace(stored, stall_ratio=2.0)
+    for wrong in (0.5, math.inf, math.nan):
+        with pytest.raises(ConfigError, match="stall_ratio"):
+            dataclasses.replace(CONFIG.robot, stall_ratio=wrong)

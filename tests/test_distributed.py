@@ -1,0 +1,361 @@
+"""Several processes that train one policy: the numbers of one process on all the data, exact resume, no orphans."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from pace.config.base import ConfigError
+from pace.config.training import load_train_config
+from pace.distributed import Team, TeamError, own_device, suitable_size, team_of
+from pace.predictor.network import PredictorNetwork
+from pace.predictor.regression import PredictorTrainer
+from pace.rl.agent import Agent, RunningNorm
+from pace.rl.ppo import PPO
+from pace.rl.rollout import Rollout
+from pace.rl.trainer import Trainer, begins_anew, summarise
+from pace.runs.checkpoint import flatten_tensors, load_checkpoint
+from pace.runs.metrics import read_metrics
+from tests.helpers.algo import CPU, small_algo
+from tests.helpers.dummy import DummyTask
+
+STEPS, WORLDS = 6, 32
+
+
+class ThreadTeam(Team):
+    """A team of threads of this process, with the arithmetic of the real one; one at a time works, the others wait."""
+
+    def __init__(self, rank: int, board: list[Any], barrier: threading.Barrier, turn: threading.Lock) -> None:
+        super().__init__(rank, len(board))
+        self.board, self.barrier, self.turn = board, barrier, turn
+
+    def gather(self, value: Any) -> list[Any]:
+        self.board[self.rank] = value
+        self._meet()
+        values = list(self.board)
+        self._meet()
+        return values
+
+    def _meet(self) -> None:
+        self.turn.release()
+        try:
+            self.barrier.wait()
+        finally:
+            self.turn.acquire()
+
+    def mean_later(self, tensors: Sequence[Tensor]) -> Callable[[], None]:
+        everyone = self.gather([tensor.clone() for tensor in tensors])
+
+        def finish() -> None:
+            for index, tensor in enumerate(tensors):
+                tensor.copy_(torch.stack([theirs[index] for theirs in everyone]).mean(0))
+
+        return finish
+
+    def sum_(self, tensor: Tensor) -> Tensor:
+        return tensor.copy_(torch.stack(self.gather(tensor.clone())).sum(0))
+
+    def follow_(self, tensors: Sequence[Tensor]) -> None:
+        first = self.gather([tensor.clone() for tensor in tensors])[0]
+        for tensor, theirs in zip(tensors, first, strict=True):
+            tensor.copy_(theirs)
+
+
+def together(work: Callable[[Team], Any], size: int = 2) -> list[Any]:
+    """``work`` of each member of a team of threads, in the order of ranks."""
+    board, barrier, turn = [None] * size, threading.Barrier(size), threading.Lock()
+
+    def run(rank: int) -> Any:
+        try:
+            with turn:
+                return work(ThreadTeam(rank, board, barrier, turn))
+        except BaseException:
+            barrier.abort()  # or the others would wait for this one for ever
+            raise
+
+    with ThreadPoolExecutor(size) as pool:
+        return [member.result() for member in [pool.submit(run, rank) for rank in range(size)]]
+
+
+def agent_of(seed: int = 3) -> Agent:
+    torch.manual_seed(seed)
+    return Agent(6, 7, 2, small_algo(autocast="fp32", epochs=1, minibatches=1), CPU)
+
+
+def filled_rollout(agent: Agent, worlds: slice) -> Rollout:
+    """The part ``worlds`` of a rollout of WORLDS worlds of made-up numbers, of ``agent``'s policy."""
+    generator = torch.Generator().manual_seed(9)
+
+    def draw(*shape: int) -> Tensor:
+        return torch.randn(STEPS, WORLDS, *shape, generator=generator)[:, worlds]
+
+    rollout = Rollout(DummyTask(worlds.stop - worlds.start), agent, STEPS)
+    rollout.policy.copy_(draw(6))
+    rollout.critic[:STEPS].copy_(draw(7))
+    with torch.no_grad():
+        rollout.scale.copy_(agent.actor.std)
+        rollout.loc.copy_(agent.actor.mlp(rollout.policy))
+        noise = draw(2)
+        rollout.action.copy_(rollout.loc + rollout.scale * noise)
+        rollout.log_prob.copy_(torch.distributions.Normal(rollout.loc, rollout.scale).log_prob(rollout.action).sum(-1))
+        rollout.value[:STEPS].copy_(agent.critic(rollout.critic[:STEPS]).squeeze(-1))
+    rollout.advantage.copy_(draw())
+    rollout.value_target.copy_(draw())
+    return rollout
+
+
+def test_two_halves_learn_what_the_whole_does() -> None:
+    def learn(agent: Agent, worlds: slice, team: Team) -> dict[str, float]:
+        return PPO(agent, small_algo(epochs=1, minibatches=1), team).update(filled_rollout(agent, worlds), 0.0)
+
+    whole, halves = agent_of(), (agent_of(), agent_of())
+    metrics = learn(whole, slice(0, WORLDS), Team())
+    parts = (slice(0, WORLDS // 2), slice(WORLDS // 2, WORLDS))
+    half_metrics = together(lambda team: learn(halves[team.rank], parts[team.rank], team))
+    assert half_metrics[0] == half_metrics[1]
+    of_parts = {"explained_variance": metrics["explained_variance"]}  # a share of variance, which is each part's own
+    assert half_metrics[0] | of_parts == pytest.approx(metrics, rel=1e-4, abs=1e-6)
+    for half in halves:
+        for name, tensor in whole.state_dict().items():
+            torch.testing.assert_close(half.state_dict()[name], tensor, rtol=0, atol=2e-6, msg=name)
+    start = agent_of().state_dict()["critic.layers.0.weight"]
+    assert (whole.state_dict()["critic.layers.0.weight"] - start).abs().max() > 1e-4
+
+
+def test_moments_are_those_of_all_observations() -> None:
+    generator = torch.Generator().manual_seed(1)
+    first, second, third = (5.0 + 3.0 * torch.randn(count, 4, generator=generator) for count in (40, 30, 50))
+
+    def play(team: Team) -> RunningNorm:
+        norm = RunningNorm(4, 8.0)
+        norm.update(first)
+        before = norm.moments()
+        norm.update((second, third)[team.rank])
+        norm.pool(before, team)
+        return norm
+
+    everything = torch.cat((first, second, third)).double()
+    for norm in together(play):
+        assert norm.count.item() == 120
+        torch.testing.assert_close(norm.mean, everything.mean(0), rtol=1e-6, atol=0)
+        torch.testing.assert_close(norm.var, everything.var(0, unbiased=False), rtol=1e-5, atol=0)
+        expected = (first[0].double() - everything.mean(0)) / (everything.var(0, unbiased=False) + 1e-4).sqrt()
+        torch.testing.assert_close(norm(first[0]), expected.float(), rtol=1e-4, atol=1e-5)
+
+
+def test_the_predictor_of_a_team_is_one_and_its_error_that_of_all_samples() -> None:
+    config = load_train_config(["predictor.batches_per_update=3"]).predictor
+
+    torch.manual_seed(4)
+    networks = [PredictorNetwork(config), PredictorNetwork(config)]
+    networks[1].load_state_dict(networks[0].state_dict())
+    inputs, targets = torch.randn(2, STEPS, 16, 15), torch.randn(2, STEPS, 16, networks[0].output_size)
+    with torch.no_grad():
+        error = networks[0](inputs.flatten(0, 2)) - targets.flatten(0, 2)
+    expected = 100.0 * error[:, networks[0].slices["apex"]].square().sum(1).mean().sqrt()
+
+    def fit(team: Team) -> dict[str, float]:
+        trainer = PredictorTrainer(networks[team.rank], config, STEPS, 16, team)
+        trainer.inputs.copy_(inputs[team.rank])
+        trainer.targets.copy_(targets[team.rank])
+        trainer.valid.fill_(True)
+        return trainer.update()
+
+    before = [parameter.detach().clone() for parameter in networks[0].parameters()]
+    first, second = together(fit)
+    assert first["predictor_rmse_cm"] == second["predictor_rmse_cm"] == pytest.approx(float(expected), rel=1e-5)
+    for one, other, old in zip(networks[0].parameters(), networks[1].parameters(), before, strict=True):
+        assert torch.equal(one, other)
+        assert not torch.equal(one, old)
+
+
+def test_rates_count_every_process() -> None:
+    def rates(team: Team) -> dict[str, float]:
+        counts = {"serves": (4.0, 12.0), "hits": (4.0, 0.0), "successes": (1.0, 1.0), "falls": (0.0, 2.0)}
+        rest = {"steps": (50.0, 50.0), "episodes": (1.0, 2.0), "reward_sum": (5.0, 15.0)}
+        return summarise({name: torch.tensor(v[team.rank]) for name, v in (counts | rest).items()}, 0.02, team)
+
+    for row in together(rates):
+        assert row["hit_rate"] == 0.25
+        assert row["success_rate"] == 0.125
+        assert row["fall_rate"] == pytest.approx(1.0)
+        assert row["mean_reward"] == pytest.approx(0.2)
+
+
+def test_size_suits_the_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pace.distributed.usable_cores", lambda: 6)
+    assert suitable_size(8, CPU) == 1
+    assert suitable_size(1024, CPU) == 4
+    assert suitable_size(4096, CPU) == 4  # 6 and 5 do not divide it
+    assert suitable_size(6000, CPU) == 6
+    assert suitable_size(4096, torch.device("cuda")) == 1
+    with pytest.raises(ConfigError, match="cannot be shared equally by 3 processes"):
+        load_train_config(["num_worlds=1024", "processes=3"])
+
+
+def test_each_process_of_torchrun_has_its_own_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    assert own_device("cuda") == "cuda"
+    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "run")
+    monkeypatch.setenv("LOCAL_RANK", "3")
+    assert [own_device(name) for name in ("cuda", "auto", "cuda:1", "cpu")] == ["cuda:3", "cuda:3", "cuda:1", "cpu"]
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    assert own_device("auto") == "auto"
+
+
+def test_processes_of_this_machine_do_not_share_a_gpu() -> None:
+    with pytest.raises(TeamError, match="torchrun --nproc-per-node=2"), team_of(2, torch.device("cuda")):
+        pass
+
+
+def test_seeds_differ_between_processes_and_the_leaders_is_its_own() -> None:
+    seeds = [Team(rank, 4).seed(seed) for seed in (1, 2) for rank in range(4)]
+    assert len(set(seeds)) == 8
+    assert seeds[0] == 1
+    assert seeds[4] == 2
+
+
+def test_another_number_of_processes_resumes_what_was_learned() -> None:
+    config = load_train_config(["num_worlds=8", "tensorboard=false", "progress=false", "algo.std_floor=0.0"])
+    first, second = (Trainer(config, DummyTask(8), PredictorNetwork(config.predictor), None) for _ in range(2))
+    first.update()
+    saved = first.checkpoint()
+    assert saved.training is not None
+    played = saved.training["processes"]
+    assert not begins_anew(saved, Team(), CPU)
+    assert begins_anew(saved, Team(), torch.device("cuda"))
+    saved.training["processes"] = [{"env": "of worlds that are not these"}] * 2
+    assert begins_anew(saved, Team(), CPU)
+    second.resume(saved)
+    saved.training["processes"] = [{"env": "of worlds on a GPU", "random_cuda": played[0]["random"]}]
+    second.resume(saved)
+    assert (second.updates, second.samples) == (1, first.samples)
+    again = second.checkpoint()
+    for part, tensors in saved.weights.items():
+        assert all(torch.equal(tensor, again.weights[part][name]) for name, tensor in tensors.items())
+    assert again.training is not None
+    before: dict[str, Tensor] = {}
+    after: dict[str, Tensor] = {}
+    for state, found in ((saved.training, before), (again.training, after)):
+        flatten_tensors({part: state[part] for part in ("ppo", "regression")}, "", found)
+    assert before.keys() == after.keys()
+    assert all(torch.equal(before[name], after[name]) for name in before)
+    second.update()
+
+
+# --- the command --------------------------------------------------------------------------------------------------
+
+UPDATE = 8 * 12
+SMALL = (
+    "num_worlds=8", "processes=2", "algo.steps=12", "algo.actor_hidden=[32]", "algo.critic_hidden=[32]",
+    "predictor.batches_per_update=2", "progress=false", "tensorboard=false",
+)  # fmt: skip
+
+
+def start(*arguments: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "pace.rl.train", *arguments]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def finish(process: subprocess.Popen[str]) -> tuple[int, str, str]:
+    out, err = process.communicate(timeout=240)
+    return process.returncode, out, err
+
+
+def wait_for_rows(run: Path, process: subprocess.Popen[str], rows: int = 2) -> None:
+    while process.poll() is None:
+        if (run / "metrics.csv").exists() and len((run / "metrics.csv").read_text().splitlines()) > rows:
+            return
+        time.sleep(0.05)
+    raise AssertionError(process.communicate())
+
+
+def children_of(pid: int) -> list[int]:
+    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def test_two_processes_train_and_resume_exactly_and_one_goes_on_from_them(tmp_path: Path) -> None:
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    status, out, err = finish(start(f"run_dir={whole}", f"samples={3 * UPDATE}", *SMALL))
+    assert status == 0, err
+    assert "8 worlds on cpu in 2 processes" in out
+    assert f"3 updates, {3 * UPDATE} samples" in out
+    assert finish(start(f"run_dir={parts}", f"samples={2 * UPDATE}", *SMALL))[0] == 0
+    status, _, err = finish(start(f"resume={parts}", f"samples={3 * UPDATE}", "progress=false"))
+    assert status == 0, err
+    expected, resumed = load_checkpoint(whole), load_checkpoint(parts)
+    assert expected.counters["samples"] == resumed.counters["samples"] == 3 * UPDATE
+    assert expected.weights["agent"]["policy_norm.count"].item() == 3 * UPDATE
+    for part, tensors in expected.weights.items():
+        for name, tensor in tensors.items():
+            assert torch.equal(tensor, resumed.weights[part][name]), f"{part} {name}"
+    assert read_metrics(whole / "metrics.csv")["mean_reward"] == read_metrics(parts / "metrics.csv")["mean_reward"]
+    first, second = (worlds["env"]["worlds.position"] for worlds in expected.training["processes"])  # type: ignore[index]
+    assert not torch.equal(first, second)  # each process plays worlds of its own
+    status, out, err = finish(start(f"resume={parts}", f"samples={4 * UPDATE}", "progress=false", "processes=1"))
+    assert status == 0, err
+    assert "update_00000003, with worlds that begin anew" in out
+    alone = load_checkpoint(parts)
+    assert alone.counters["samples"] == 4 * UPDATE
+    assert alone.weights["agent"]["policy_norm.count"].item() == 4 * UPDATE
+    assert len(alone.training["processes"]) == 1  # type: ignore[index]
+
+
+def test_the_jobs_of_a_sweep_have_helpers_of_their_own(tmp_path: Path) -> None:
+    """Hydra's ``-m`` runs the command once for each value; a helper plays the task of its leader's job."""
+    run_dir = f"run_dir={tmp_path}/${{seed}}_${{sensing.name}}"
+    status, _, err = finish(
+        start("-m", "sensing=clean,wide", f"hydra.sweep.dir={tmp_path}", run_dir, f"samples={UPDATE}", *SMALL)
+    )
+    assert status == 0, err
+    delays = []
+    for name in ("clean", "wide"):
+        training = load_checkpoint(tmp_path / f"1_{name}").training
+        assert training is not None
+        delays.append([float(own["env"]["sensing._delay"].max()) for own in training["processes"]])
+    assert delays[0] == [0.0, 0.0]
+    assert min(delays[1]) > 0.5  # control steps
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="looks for child processes in /proc")
+def test_ctrl_c_saves_and_a_lost_process_is_told(tmp_path: Path) -> None:
+    process = start(f"run_dir={tmp_path / 'stopped'}", "minutes=10", *SMALL)
+    wait_for_rows(tmp_path / "stopped", process)
+    children = children_of(process.pid)
+    process.send_signal(signal.SIGINT)
+    status, out, err = finish(process)
+    assert status == 0, err
+    assert "stopped by SIGINT" in out
+    updates = len(read_metrics(tmp_path / "stopped" / "metrics.csv")["update"])
+    assert load_checkpoint(tmp_path / "stopped").counters["updates"] == updates
+    assert len(children) == 1
+    assert not Path(f"/proc/{children[0]}").exists()
+
+    process = start(f"run_dir={tmp_path / 'lost'}", "minutes=10", *SMALL)
+    wait_for_rows(tmp_path / "lost", process)
+    os.kill(children_of(process.pid)[0], signal.SIGKILL)
+    status, _, err = finish(process)
+    assert status == 1
+    assert "error: process 1 of 2 ended with status -9" in err
+
+    process = start(f"run_dir={tmp_path / 'killed'}", "minutes=10", *SMALL)
+    wait_for_rows(tmp_path / "killed", process)
+    (orphan,) = children_of(process.pid)
+    process.kill()
+    finish(process)
+    deadline = time.monotonic() + 30.0
+    while Path(f"/proc/{orphan}").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not Path(f"/proc/{orphan}").exists()  # a helper ends with its leader
