@@ -20,12 +20,11 @@ from tqdm import tqdm
 
 from pace.command import quote
 from pace.config.base import ConfigError, to_dict
-from pace.config.training import load_train_config
+from pace.config.training import RESUME_KEYS, load_train_config
 from pace.runs.checkpoint import list_checkpoints, read_meta
+from pace.runs.interrupt import StopRequest
 from pace.runs.progress import SECONDS_PER_LINE, clock
 from pace.runs.run_folder import LEADING, METRICS
-from pace.config.training import RESUME_KEYS
-from pace.runs.interrupt import StopRequest
 
 TRAIN = (sys.executable, "-m", "pace.rl.train")
 POLL_SECONDS = 0.5

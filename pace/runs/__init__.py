@@ -1,0 +1,3 @@
+"""The folder of a run: checkpoints, metrics, progress, interruption, and queues of runs.
+
+Here belongs what is written to disk and read back, whatever is trained. Imports ``config`` and ``arrays``."""
