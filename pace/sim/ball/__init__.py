@@ -3,6 +3,6 @@
 Public names: :class:`BallParams` (with ``preset``), :class:`BallSim`, :class:`Forecast`.
 """
 
-from pace.sim.ball.ball import BallParams, BallSim, Forecast
+from pace.sim.ball.ball import BallParams, BallSim, Forecast, ball_preset
 
-__all__ = ["BallParams", "BallSim", "Forecast"]
+__all__ = ["BallParams", "BallSim", "Forecast", "ball_preset"]
