@@ -6,16 +6,22 @@ PYTHON ?= python3.11 python3.12 python3.13 python3.14 python3 python
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help train test lint bench venv lock clean
+.PHONY: help train test test-fast test-long lint bench venv lock clean
 
 help:  ## list the targets
-	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## ?/\1\t/' | expand -t 10
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## ?/\1\t/' | expand -t 12
 
 train: venv  ## train a policy: python -m pace.rl.train $(ARGS)
 	$(BIN)/python -m pace.rl.train $(ARGS)
 
-test: venv  ## run the test suite: pytest $(ARGS)
+test: venv  ## run the test suite, the fast tests first: pytest $(ARGS)
 	$(BIN)/python -m pytest $(ARGS)
+
+test-fast: venv  ## leave out the end-to-end runs
+	$(BIN)/python -m pytest -m "not slow and not long" $(ARGS)
+
+test-long: venv  ## what takes many minutes: wheels, kills, compilations
+	$(BIN)/python -m pytest -m long $(ARGS)
 
 lint: venv  ## ruff and pyright
 	$(BIN)/ruff check .
