@@ -11,7 +11,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from pace.arrays.share import record, share
+from pace.arrays.launch import MaskedLaunch
+from pace.arrays.share import share
 
 
 @wp.struct
@@ -57,19 +58,18 @@ class Draws:
     """
 
     def __init__(self, columns: Sequence[Column], generator: torch.Generator) -> None:
-        self._columns, self._generator = columns, generator  # the kernel knows the tensors by address alone
+        self._columns, self._generator = columns, generator  # the kernel's table knows the tensors by address alone
         num_worlds, device = columns[0].values.shape[0], columns[0].values.device
-        self._mask = torch.zeros(num_worlds, dtype=torch.bool, device=device)
         self._seed = torch.zeros(1, dtype=torch.int32, device=device)
-        where = wp.device_from_torch(device)
-        table = wp.array([_arrays(column) for column in columns], dtype=ColumnArrays, device=where)
-        self._draw = record(_draw, num_worlds, [share(self._mask), share(self._seed), table], device)
+        table = wp.array(
+            [_arrays(column) for column in columns], dtype=ColumnArrays, device=wp.device_from_torch(device)
+        )
+        self._draw = MaskedLaunch(_draw, num_worlds, device, seed=self._seed, columns=table)
 
     def __call__(self, mask: Tensor) -> None:
         """Draw for the worlds of ``mask`` (N,) bool; the others keep what they have."""
-        self._mask.copy_(mask)
         self._seed.random_(generator=self._generator)
-        self._draw()
+        self._draw(mask)
 
 
 def _arrays(column: Column) -> ColumnArrays:

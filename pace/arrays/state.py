@@ -1,39 +1,49 @@
-"""The tensors that an object owns, as a dictionary to save and to put back."""
+"""What an object must remember to resume: tensors that it declares, as a dictionary to save and to put back."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import ClassVar
+
 from torch import Tensor
 
-#: Attributes that a call fills before it reads them.
-SCRATCH = ("_mask", "_seed")
 
+class Stateful:
+    """Has a state of tensors, which are allocated once: the attributes that ``STATE`` names, or :meth:`state_tensors`.
 
-def _owned(owner: object) -> dict[str, Tensor]:
-    """Tensors that are attributes of ``owner``, without views of others and the mask and seed of the last call."""
-    tensors = {name: value for name, value in vars(owner).items() if isinstance(value, Tensor)}
-    return {name: value for name, value in tensors.items() if name not in SCRATCH and not value._is_view()}
-
-
-def snapshot(owner: object) -> dict[str, Tensor]:
-    """Copies of the tensors that ``owner`` has as attributes, by name; views are left out."""
-    return {name: value.clone() for name, value in _owned(owner).items()}
-
-
-def restore(owner: object, state: dict[str, Tensor]) -> None:
-    """Write the tensors of :func:`snapshot` back in place.
-
-    Errors: ``KeyError`` for a missing tensor, ``RuntimeError`` for another shape.
+    The names are part of the format of checkpoints.
     """
-    for name, value in _owned(owner).items():
-        value.copy_(state[name])
+
+    STATE: ClassVar[tuple[str, ...]] = ()
+
+    def state_tensors(self) -> dict[str, Tensor]:
+        """The tensors themselves, by name."""
+        return tensors_named(self, self.STATE)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Copies of the tensors, by name."""
+        return {name: tensor.clone() for name, tensor in self.state_tensors().items()}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Put back what :meth:`state_dict` returned, in place.
+
+        Errors: ``KeyError`` for a missing tensor, ``RuntimeError`` for another shape.
+        """
+        for name, tensor in self.state_tensors().items():
+            tensor.copy_(state[name])
 
 
-def with_prefix(prefix: str, state: dict[str, Tensor]) -> dict[str, Tensor]:
+def tensors_named(owner: object, names: tuple[str, ...]) -> dict[str, Tensor]:
+    """Attributes of ``owner`` by name."""
+    return {name: getattr(owner, name) for name in names}
+
+
+def with_prefix(prefix: str, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The same tensors under ``prefix.name``."""
     return {f"{prefix}.{name}": value for name, value in state.items()}
 
 
-def under_prefix(prefix: str, state: dict[str, Tensor]) -> dict[str, Tensor]:
+def under_prefix(prefix: str, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The tensors stored under ``prefix.``, with the prefix taken off."""
     start = f"{prefix}."
     return {name.removeprefix(start): value for name, value in state.items() if name.startswith(start)}

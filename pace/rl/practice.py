@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import torch
 from torch import Tensor
 
+from pace.arrays.tensors import allocate
 from pace.config.training import TrainConfig
 from pace.sim.ball.ball import BallParams, BallSim
 from pace.sim.engine.base import EngineParams
 from pace.sim.randomization import Randomizer
 from pace.sim.robot import build_model
+from pace.sim.robot_state import RobotState
 from pace.sim.sensing import Sensing
 from pace.task.game import Game
 from pace.task.observations import BallTrack
@@ -54,8 +54,7 @@ class ServePractice:
         self._track = BallTrack(config.predictor.frames, self._game.rules, count, device)
         self._path = torch.full((count, 2, 12), FAR_AWAY, device=device)
         self._path[:, :, 3:] = torch.tensor([1.0, *[0.0] * 8], device=device)  # a unit normal, at rest
-        still = {name: torch.zeros(count, size, device=device) for name, size in STILL_ROBOT.items()}
-        self._robot: SimpleNamespace = SimpleNamespace(**still)
+        self._robot = allocate(RobotState, count, device, joints=0, feet=0, bodies=0)
         joints = torch.zeros(0, device=device)
         self.sensing = Sensing(config.sensing, count, device, config.robot.control_dt, joints, self.generator)
         self.predictor_input = self._track.positions
@@ -97,21 +96,11 @@ class ServePractice:
         self._game.start_serve(mask)
 
     def _sense(self, new_ball: Tensor) -> None:
-        self.sensing.update(self._robot, self.ball.position, new_ball)  # type: ignore[arg-type]
-        self.sensing.reset(new_ball, self._robot, self.ball.position)  # type: ignore[arg-type]
+        self.sensing.update(self._robot, self.ball.position, new_ball)
+        self.sensing.reset(new_ball, self._robot, self.ball.position)
         self._track.update(self.sensing.ball_position, new_ball)
         target, now = self._game.target, self._game.clock.time
         parts = {"apex": target.apex, "target": target.point, "target_time": (target.time - now).unsqueeze(-1)}
         self.predictor_target = torch.cat([parts[name] for name in self.config.predictor.outputs], dim=1)
         self.predictor_time_to_apex = target.apex_time - now
         self.predictor_valid = target.something_to_hit
-
-
-STILL_ROBOT = {
-    "base_angular_velocity": 3,
-    "projected_gravity": 3,
-    "joint_position": 0,
-    "joint_velocity": 0,
-    "base_position": 3,
-    "heading": 2,
-}

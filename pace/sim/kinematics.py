@@ -13,7 +13,7 @@ import warp as wp
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pace.arrays.share import record
+from pace.arrays.launch import Bound, Launch, MaskedLaunch
 from pace.sim.robot import FEET
 
 #: The tips, in the order of the chains: sites of the model.
@@ -97,7 +97,6 @@ def _store(row: wp.array[float], start: int, value: wp.vec3):
 @wp.kernel
 def _update(
     mask: wp.array[wp.bool],
-    masked: int,
     chains: Chains,
     qpos_path: wp.array3d[float],
     qvel_path: wp.array3d[float],
@@ -107,12 +106,9 @@ def _update(
     foot_up: wp.array3d[float],
     head_position: wp.array2d[float],
 ):
-    """One item of one world: the paddle at each instant of the path, then both feet and the head at its end.
-
-    With ``masked`` of the masked worlds only.
-    """
+    """One item of one masked world: the paddle at each instant of the path, then both feet and the head at its end."""
     world, item = wp.tid()
-    if masked == 1 and not mask[world]:
+    if not mask[world]:
         return
     instants = qpos_path.shape[1]
     instant = wp.min(item, instants - 1)
@@ -138,7 +134,6 @@ def _update(
 @wp.kernel
 def _paddle_pose(
     mask: wp.array[wp.bool],
-    masked: int,
     chains: Chains,
     base_position: wp.array2d[float],
     base_quat: wp.array2d[float],
@@ -146,9 +141,9 @@ def _paddle_pose(
     centre: wp.array2d[float],
     normal: wp.array2d[float],
 ):
-    """Centre and normal of one world's paddle; masked: of those of the mask alone."""
+    """Centre and normal of one masked world's paddle."""
     world = wp.tid()
-    if masked == 1 and not mask[world]:
+    if not mask[world]:
         return
     frame = Frame()
     frame.position = wp.vec3(base_position[world, 0], base_position[world, 1], base_position[world, 2])
@@ -247,14 +242,15 @@ class Kinematics:
         self.foot_velocity = torch.zeros(num_worlds, 2, 3, device=device)
         self.foot_up = torch.zeros(num_worlds, 2, 3, device=device)
         self.head_position = torch.zeros(num_worlds, 3, device=device)
-        outputs = (self.paddle_path, self.foot_position, self.foot_velocity, self.foot_up, self.head_position)
-        self._outputs = [wp.from_torch(t) for t in outputs]
-        self._mask = torch.zeros(num_worlds, dtype=torch.bool, device=device)
-        self._path: tuple[Tensor, Tensor] | None = None
         self._sensed_centre = torch.zeros(num_worlds, 3, device=device)
         self._sensed_normal = torch.zeros(num_worlds, 3, device=device)
-        self._sensed_pose: tuple[Tensor | None, ...] = (None, None, None)
-        self._push: tuple[Tensor | None, ...] = (None, None, None)
+        self._path: tuple[Tensor, Tensor] | None = None
+        n, instants = num_worlds, substeps + 1
+        paths = {"qpos_path": (n, instants, model.nq), "qvel_path": (n, instants, model.nv)}
+        self._update = Bound(self._record_update, **paths)
+        pose = {"base_position": (n, 3), "base_quat": (n, 4), "joint_position": (n, model.nu)}
+        self._pose = Bound(self._record_pose, **pose)
+        self._push = Bound(self._record_push, **paths, force=(n, 3), point=(n, 3), out=(n, model.nv))
 
     def update(self, qpos_path: Tensor, qvel_path: Tensor, mask: Tensor | None = None) -> None:
         """Fill the attributes from qpos (N, S + 1, 28) and qvel (N, S + 1, 27).
@@ -262,26 +258,24 @@ class Kinematics:
         ``mask`` (N,) bool: the worlds in which they are new; ``None``: all. The path is remembered:
         :meth:`paddle_generalized_force` uses its end.
         """
-        if self._path is None or self._path[0] is not qpos_path or self._path[1] is not qvel_path:
-            self._bind(qpos_path, qvel_path)
-        if mask is None:
-            self._update()
-        else:
-            self._mask.copy_(mask)
-            self._update_masked()
+        self._update(qpos_path, qvel_path)(mask)
 
-    def _bind(self, qpos_path: Tensor, qvel_path: Tensor) -> None:
-        worlds, instants, _ = self.paddle_path.shape
-        for name, path, width in (("qpos_path", qpos_path, 28), ("qvel_path", qvel_path, 27)):
-            if path.shape != (worlds, instants, width):
-                raise ValueError(f"{name} must be {(worlds, instants, width)}, not {tuple(path.shape)}")
+    def _record_update(self, qpos_path: Tensor, qvel_path: Tensor) -> MaskedLaunch:
         self._path = (qpos_path, qvel_path)
-        self._warp_path = [wp.from_torch(qpos_path), wp.from_torch(qvel_path)]
-        self._push = (None, None, None)  # its launch holds the old path
-        inputs = [self._chains, *self._warp_path, *self._outputs]
-        mask, items = wp.from_torch(self._mask), (worlds, instants + len(TIPS) - 1)
-        self._update = record(_update, items, [mask, 0, *inputs], self._device)
-        self._update_masked = record(_update, items, [mask, 1, *inputs], self._device)
+        worlds, instants, _ = self.paddle_path.shape
+        return MaskedLaunch(
+            _update,
+            (worlds, instants + len(TIPS) - 1),
+            self._device,
+            chains=self._chains,
+            qpos_path=qpos_path,
+            qvel_path=qvel_path,
+            paddle_path=self.paddle_path,
+            foot_position=self.foot_position,
+            foot_velocity=self.foot_velocity,
+            foot_up=self.foot_up,
+            head_position=self.head_position,
+        )
 
     def paddle_pose(
         self, base_position: Tensor, base_quat: Tensor, joint_position: Tensor, mask: Tensor | None = None
@@ -292,22 +286,21 @@ class Kinematics:
         which they are new, ``None``: all. The two tensors returned are overwritten by the next call. Give the same
         tensors each time: others are bound anew, which takes longer.
         """
-        pose = (base_position, base_quat, joint_position)
-        if any(given is not bound for given, bound in zip(pose, self._sensed_pose, strict=True)):
-            self._bind_pose(pose)
-        if mask is None:
-            self._compute_pose()
-        else:
-            self._mask.copy_(mask)
-            self._compute_masked_pose()
+        self._pose(base_position, base_quat, joint_position)(mask)
         return self._sensed_centre, self._sensed_normal
 
-    def _bind_pose(self, pose: tuple[Tensor, Tensor, Tensor]) -> None:
-        self._sensed_pose = pose
-        self._warp_pose = [wp.from_torch(t) for t in (*pose, self._sensed_centre, self._sensed_normal)]
-        inputs, mask = [self._chains, *self._warp_pose], wp.from_torch(self._mask)
-        self._compute_pose = record(_paddle_pose, self._num_worlds, [mask, 0, *inputs], self._device)
-        self._compute_masked_pose = record(_paddle_pose, self._num_worlds, [mask, 1, *inputs], self._device)
+    def _record_pose(self, base_position: Tensor, base_quat: Tensor, joint_position: Tensor) -> MaskedLaunch:
+        return MaskedLaunch(
+            _paddle_pose,
+            self._num_worlds,
+            self._device,
+            chains=self._chains,
+            base_position=base_position,
+            base_quat=base_quat,
+            joint_position=joint_position,
+            centre=self._sensed_centre,
+            normal=self._sensed_normal,
+        )
 
     def paddle_generalized_force(self, force: Tensor, point: Tensor, out: Tensor) -> None:
         """Write J^T f of a force on the paddle's link into ``out`` (N, 27), for the end of the path last given.
@@ -316,15 +309,19 @@ class Kinematics:
         bound anew, which takes longer.
         Errors: RuntimeError before the first :meth:`update`.
         """
-        push = (force, point, out)
-        if any(given is not bound for given, bound in zip(push, self._push, strict=True)):
-            self._bind_push(push)
-        self._compute_push()
-
-    def _bind_push(self, push: tuple[Tensor, Tensor, Tensor]) -> None:
         if self._path is None:
             raise RuntimeError("paddle_generalized_force needs the robot's state: call update() first")
-        self._push = push
-        self._warp_push = [wp.from_torch(t) for t in push]
-        inputs = [self._chains, *self._warp_path, *self._warp_push]
-        self._compute_push = record(_paddle_jacobian_transpose, self._num_worlds, inputs, self._device)
+        self._push(*self._path, force, point, out)()
+
+    def _record_push(self, qpos_path: Tensor, qvel_path: Tensor, force: Tensor, point: Tensor, out: Tensor) -> Launch:
+        return Launch(
+            _paddle_jacobian_transpose,
+            self._num_worlds,
+            self._device,
+            chains=self._chains,
+            qpos_path=qpos_path,
+            qvel_path=qvel_path,
+            force=force,
+            point=point,
+            out=out,
+        )

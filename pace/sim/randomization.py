@@ -10,7 +10,8 @@ import warp as wp
 from torch import Tensor
 
 from pace.arrays.draws import Column, Draws
-from pace.arrays.share import record, share
+from pace.arrays.launch import Launch
+from pace.arrays.state import Stateful, tensors_named, with_prefix
 from pace.config.base import ConfigError
 from pace.config.sim import BallConfig, RandomizationConfig
 from pace.sim.ball.ball import BallParams
@@ -55,7 +56,7 @@ def _push(
     push[world, 1] = y
 
 
-class Randomizer:
+class Randomizer(Stateful):
     """Draws the parameters of N worlds at reset, and the pushes in between.
 
     Attributes: ``actuator_delay`` (N,) s; ``push`` (N, nv) velocity to add to the generalized velocity before the
@@ -86,9 +87,17 @@ class Randomizer:
         self._until_push = torch.zeros(num_worlds, device=device)
         self._draw = Draws(self._columns(), generator)
         self._seed = torch.zeros(1, dtype=torch.int32, device=device)
-        ranges = [wp.vec2(*config.push_interval), wp.vec2(*config.push_velocity)]
-        state = [share(self._until_push), wp.from_torch(self.push)]
-        self._advance_push = record(_push, num_worlds, [share(self._seed), control_dt, *ranges, *state], device)
+        self._advance_push = Launch(
+            _push,
+            num_worlds,
+            device,
+            seed=self._seed,
+            control_dt=control_dt,
+            interval=config.push_interval,
+            velocity=config.push_velocity,
+            until_push=self._until_push,
+            push=self.push,
+        )
         self.draw(torch.ones(num_worlds, dtype=torch.bool, device=device))
 
     def _columns(self) -> list[Column]:
@@ -116,13 +125,8 @@ class Randomizer:
         self._advance_push()
         return self.push
 
-    def state_dict(self) -> dict[str, Tensor]:
+    def state_tensors(self) -> dict[str, Tensor]:
         """Everything that was drawn, for an exact resume."""
-        state = {f"engine.{name}": getattr(self._engine_params, name) for name in ENGINE_DRAWS}
-        state |= {f"ball.{name}": getattr(self._ball_params, name) for name in BALL_DRAWS}
-        return state | {"actuator_delay": self.actuator_delay, "until_push": self._until_push}
-
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Put back what :meth:`state_dict` returned; shapes must match."""
-        for name, tensor in self.state_dict().items():
-            tensor.copy_(state[name])
+        engine = with_prefix("engine", tensors_named(self._engine_params, ENGINE_DRAWS))
+        ball = with_prefix("ball", tensors_named(self._ball_params, tuple(BALL_DRAWS)))
+        return engine | ball | {"actuator_delay": self.actuator_delay, "until_push": self._until_push}

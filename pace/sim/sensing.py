@@ -6,48 +6,40 @@ Everything that an actor may see of the world passes through :class:`Sensing`; i
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import torch
 import warp as wp
 from torch import Tensor
 
-from pace.arrays.share import record, share
+from pace.arrays.launch import Bound, MaskedLaunch
+from pace.arrays.state import Stateful
 from pace.config.sim import SensingConfig
-
-if TYPE_CHECKING:
-    from pace.sim.worlds import RobotState
+from pace.sim.robot_state import RobotArrays, RobotState
 
 #: Columns of a motion-capture frame: base position 3, ball position 3, heading 2.
 MOCAP_COLUMNS = 8
 BASE, BALL, HEADING = wp.constant(0), wp.constant(3), wp.constant(6)
 
 
-@wp.struct
-class Truth:
-    """The quantities that sensors look at."""
-
-    base_angular_velocity: wp.array[wp.vec3]
-    projected_gravity: wp.array[wp.vec3]
-    joint_position: wp.array2d[wp.float32]
-    joint_velocity: wp.array2d[wp.float32]
-    base_position: wp.array[wp.vec3]
-    ball_position: wp.array[wp.vec3]
-    heading: wp.array2d[wp.float32]
-
-
 @wp.func
-def _see(truth: Truth, line: wp.array2d[wp.float32], world: int, new_ball: bool, new_world: bool):
+def _see(
+    robot: RobotArrays,
+    ball_position: wp.array[wp.vec3],
+    line: wp.array2d[wp.float32],
+    world: int,
+    new_ball: bool,
+    new_world: bool,
+):
     """Put the newest motion-capture frame into a world's line, newest first; what is new has no past."""
     if not new_world:
         for age in range(line.shape[0] - 1, 0, -1):
             for column in range(line.shape[1]):
                 line[age, column] = line[age - 1, column]
     for i in range(3):
-        line[0, BASE + i] = truth.base_position[world][i]
-        line[0, BALL + i] = truth.ball_position[world][i]
+        line[0, BASE + i] = robot.base_position[world][i]
+        line[0, BALL + i] = ball_position[world][i]
     for i in range(2):
-        line[0, HEADING + i] = truth.heading[world, i]
+        line[0, HEADING + i] = robot.heading[world][i]
     for age in range(1, line.shape[0]):
         for column in range(line.shape[1]):
             ball_column = column >= BALL and column < HEADING
@@ -85,7 +77,8 @@ def _sense(
     mask: wp.array[wp.bool],
     reset: int,
     seed: wp.array[wp.int32],
-    truth: Truth,
+    robot: RobotArrays,
+    ball_position: wp.array[wp.vec3],
     nominal: wp.array[wp.float32],
     delay: wp.array[wp.float32],
     delays: wp.vec2,
@@ -101,7 +94,7 @@ def _sense(
     world = wp.tid()
     if reset == 1 and not mask[world]:
         return
-    _see(truth, line[world], world, mask[world], reset == 1)
+    _see(robot, ball_position, line[world], world, mask[world], reset == 1)
     row = sensed[world]
     random = wp.rand_init(seed[world])
     if reset == 1:
@@ -111,11 +104,11 @@ def _sense(
         row[column] = scale[world] * amplitude[column] * (2.0 * wp.randf(random) - 1.0)
     joints = nominal.shape[0]
     for i in range(3):
-        row[i] += truth.base_angular_velocity[world][i]
-        row[3 + i] += truth.projected_gravity[world][i]
+        row[i] += robot.base_angular_velocity[world][i]
+        row[3 + i] += robot.projected_gravity[world][i]
     for joint in range(joints):
-        row[6 + joint] += truth.joint_position[world, joint] - nominal[joint]
-        row[6 + joints + joint] += truth.joint_velocity[world, joint]
+        row[6 + joint] += robot.joint_position[world, joint] - nominal[joint]
+        row[6 + joints + joint] += robot.joint_velocity[world, joint]
     mocap = 6 + 2 * joints
     for column in range(line.shape[2]):
         row[mocap + column] += _late(line[world], delay[world], column)
@@ -123,7 +116,7 @@ def _sense(
     base_quat[world] = orientation(gravity, row[mocap + HEADING], row[mocap + HEADING + 1])
 
 
-class Sensing:
+class Sensing(Stateful):
     """Sensed signals of N worlds, overwritten in place once a control step.
 
     Everything has uniform noise, whose amplitudes have a common scale that is drawn per world at reset. Motion capture
@@ -137,6 +130,8 @@ class Sensing:
     heading (yaw) give it, ``base_shift_noise`` (N, 2) m for what is computed from sensed values; world frame unless
     said.
     """
+
+    STATE = ("_nominal", "_amplitude", "_sensed", "base_quat", "_line", "_delay", "_scale")
 
     def __init__(
         self,
@@ -174,8 +169,7 @@ class Sensing:
         self._delay = torch.zeros(num_worlds, device=device)  # in control steps
         self._scale = torch.ones(num_worlds, device=device)
         self._seed = torch.zeros(num_worlds, dtype=torch.int32, device=device)
-        self._mask = torch.zeros(num_worlds, dtype=torch.bool, device=device)
-        self._bound: tuple[RobotState, Tensor] | None = None
+        self._bound = Bound(self._record, robot=None, ball_position=(num_worlds, 3))
 
     @property
     def delay(self) -> Tensor:
@@ -184,31 +178,29 @@ class Sensing:
 
     def update(self, robot: RobotState, ball_position: Tensor, new_ball: Tensor) -> None:
         """One control step later: sense the state; ``new_ball`` (N,) bool marks balls that were just launched."""
-        self._prepare(robot, ball_position, new_ball)
-        self._update()
+        self._seed.random_(generator=self._generator)
+        self._bound(robot, ball_position)[0](new_ball)
 
     def reset(self, mask: Tensor, robot: RobotState, ball_position: Tensor) -> None:
         """Draw new delays for the worlds of ``mask`` (N,) bool and sense them as if they had stood still so far."""
-        self._prepare(robot, ball_position, mask)
-        self._reset()
-
-    def _prepare(self, robot: RobotState, ball_position: Tensor, mask: Tensor) -> None:
-        if self._bound is None or self._bound[0] is not robot or self._bound[1] is not ball_position:
-            self._bind(robot, ball_position)
-        self._mask.copy_(mask)
         self._seed.random_(generator=self._generator)
+        self._bound(robot, ball_position)[1](mask)
 
-    def _bind(self, robot: RobotState, ball_position: Tensor) -> None:
-        self._bound = (robot, ball_position)
-        truth = Truth()
-        truth.ball_position = share(ball_position)
-        for name in Truth.vars:  # type: ignore[attr-defined]
-            if name != "ball_position":
-                setattr(truth, name, share(getattr(robot, name)))
-        fixed = [wp.from_torch(self._nominal), wp.from_torch(self._delay), wp.vec2(*self._delays)]
-        fixed += [wp.from_torch(self._scale), wp.vec2(*self._scales)]
-        state = [wp.from_torch(tensor) for tensor in (self._amplitude, self._line, self._sensed)]
-        shared = [share(self._seed), truth, *fixed, *state, wp.from_torch(self.base_quat, dtype=wp.vec4)]
-        mask = share(self._mask)
-        self._update = record(_sense, self._num_worlds, [mask, 0, *shared], self._device)
-        self._reset = record(_sense, self._num_worlds, [mask, 1, *shared], self._device)
+    def _record(self, robot: RobotState, ball_position: Tensor) -> tuple[MaskedLaunch, MaskedLaunch]:
+        """Update and reset."""
+        given = {
+            "seed": self._seed,
+            "robot": robot,
+            "ball_position": ball_position,
+            "nominal": self._nominal,
+            "delay": self._delay,
+            "delays": self._delays,
+            "scale": self._scale,
+            "scales": self._scales,
+            "amplitude": self._amplitude,
+            "line": self._line,
+            "sensed": self._sensed,
+            "base_quat": self.base_quat,
+        }
+        update, reset = (MaskedLaunch(_sense, self._num_worlds, self._device, reset=reset, **given) for reset in (0, 1))
+        return update, reset

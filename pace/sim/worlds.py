@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
 
 import mujoco
 import torch
 import warp as wp
 from torch import Tensor
 
-from pace.arrays.share import record, require_shape, share
-from pace.arrays.state import under_prefix, with_prefix
+from pace.arrays.launch import Bound, Launch, MaskedLaunch
+from pace.arrays.state import Stateful, tensors_named, under_prefix, with_prefix
+from pace.arrays.tensors import named_tensors
 from pace.config.sim import SimConfig
 from pace.devices import resolve_device
 from pace.sim.ball.ball import BallParams, BallSim
@@ -19,41 +20,12 @@ from pace.sim.engine.factory import make_engine
 from pace.sim.kinematics import Kinematics
 from pace.sim.randomization import Randomizer
 from pace.sim.robot import JOINT_NAMES, build_model, nominal_pose
-
-
-@dataclass(frozen=True)
-class RobotState:
-    """The robot at the end of the last control step: tensors (N, ...), float32, world frame unless said.
-
-    The tensors are the same objects for ever and are overwritten by each step. Contact forces, body contacts and
-    joint torques belong to the last physics step.
-    """
-
-    joint_position: Tensor  # (N, 21) rad
-    joint_velocity: Tensor  # (N, 21) rad/s
-    joint_acceleration: Tensor  # (N, 21) rad/s^2, mean over the control step
-    joint_torque: Tensor  # (N, 21) N m
-    base_position: Tensor  # (N, 3) m
-    base_quat: Tensor  # (N, 4) w, x, y, z
-    base_linear_velocity: Tensor  # (N, 3) m/s
-    base_angular_velocity: Tensor  # (N, 3) rad/s, body frame
-    projected_gravity: Tensor  # (N, 3) unit vector, body frame
-    heading: Tensor  # (N, 2) the base's x axis on the ground, unit vector
-    paddle_position: Tensor  # (N, 3) m, centre of the blade
-    paddle_normal: Tensor  # (N, 3) unit vector
-    paddle_velocity: Tensor  # (N, 3) m/s
-    foot_position: Tensor  # (N, 2, 3) m, left and right
-    foot_velocity: Tensor  # (N, 2, 3) m/s
-    foot_up: Tensor  # (N, 2, 3) unit vector, the foot's z axis
-    foot_force: Tensor  # (N, 2, 3) N
-    body_contact: Tensor  # (N, B) 1 where a body other than the feet touches something
-    head_position: Tensor  # (N, 3) m
+from pace.sim.robot_state import RobotState
 
 
 @wp.kernel
 def _derive(
     mask: wp.array[wp.bool],
-    masked: int,
     qpos: wp.array3d[float],
     qvel: wp.array3d[float],
     last: int,
@@ -62,10 +34,9 @@ def _derive(
     heading: wp.array2d[float],
     acceleration: wp.array2d[float],
 ):
-    """Gravity in the body frame, heading on the ground and mean joint acceleration of one world; masked: of those of
-    the mask alone."""
+    """Gravity in the body frame, heading on the ground and mean joint acceleration of one masked world."""
     world = wp.tid()
-    if masked == 1 and not mask[world]:
+    if not mask[world]:
         return
     w = qpos[world, last, 3]
     x = qpos[world, last, 4]
@@ -128,7 +99,7 @@ def _launch_ball(
         own_spin[world, i] = spin[world, i]
 
 
-class Worlds:
+class Worlds(Stateful):
     """Robot and ball in N worlds. ``step`` is one control step; nothing in it waits for the host.
 
     Args:
@@ -192,23 +163,43 @@ class Worlds:
         self._new_share = torch.zeros(n, self.config.substeps, 1, device=device)
         self._applied = torch.zeros(n, self.model.nv, device=device)
         self._reaction, self._reaction_point = torch.zeros(n, 3, device=device), torch.zeros(n, 3, device=device)
-        self._mask = torch.zeros(n, dtype=torch.bool, device=device)
-        self._launch: tuple[Tensor | None, ...] = (None, None, None)
         self._record()
         self.robot = self._robot_state()
         self._update_delay()
 
     def _record(self) -> None:
-        n, device, mask = self.num_worlds, self.device, share(self._mask)
-        qpos, qvel = wp.from_torch(self.engine.qpos_path), wp.from_torch(self.engine.qvel_path)
-        derived = [wp.from_torch(t) for t in (self._gravity, self._heading, self._acceleration)]
-        inputs = [qpos, qvel, self.config.substeps, 1.0 / self.control_dt, *derived]
-        self._derive = record(_derive, n, [mask, 0, *inputs], device)
-        self._derive_masked = record(_derive, n, [mask, 1, *inputs], device)
-        held = [wp.from_torch(self._previous_targets), share(self.ball.events.paddle_impulse)]
-        self._stand = record(_stand, n, [mask, qpos, *held], device)
-        delay, new_share = share(self.randomizer.actuator_delay), wp.from_torch(self._new_share.squeeze(-1))
-        self._update_delay = record(_spread_delay, n, [delay, self.config.engine.physics_dt, new_share], device)
+        n, device, qpos = self.num_worlds, self.device, self.engine.qpos_path
+        self._derive = MaskedLaunch(
+            _derive,
+            n,
+            device,
+            qpos=qpos,
+            qvel=self.engine.qvel_path,
+            last=self.config.substeps,
+            inverse_dt=1.0 / self.control_dt,
+            gravity=self._gravity,
+            heading=self._heading,
+            acceleration=self._acceleration,
+        )
+        impulse = self.ball.events.paddle_impulse
+        self._stand = MaskedLaunch(
+            _stand, n, device, qpos=qpos, previous_targets=self._previous_targets, impulse=impulse
+        )
+        self._update_delay = Launch(
+            _spread_delay,
+            n,
+            device,
+            delay=self.randomizer.actuator_delay,
+            physics_dt=self.config.engine.physics_dt,
+            new_share=self._new_share.squeeze(-1),
+        )
+        self._serve = Bound(self._record_serve, position=(n, 3), velocity=(n, 3), spin=(n, 3))
+
+    def _record_serve(self, position: Tensor, velocity: Tensor, spin: Tensor) -> MaskedLaunch:
+        ball = self.ball
+        own = {"own_position": ball.position, "own_velocity": ball.velocity, "own_spin": ball.spin}
+        given = {"position": position, "velocity": velocity, "spin": spin}
+        return MaskedLaunch(_launch_ball, self.num_worlds, self.device, **given, **own)
 
     def _robot_state(self) -> RobotState:
         qpos, qvel = self.engine.qpos_path[:, -1], self.engine.qvel_path[:, -1]
@@ -270,11 +261,7 @@ class Worlds:
     def _observe(self, mask: Tensor | None = None) -> None:
         """Derive ``robot`` from the engine's paths; ``mask`` (N,) bool: the worlds in which they are new."""
         self.kinematics.update(self.engine.qpos_path, self.engine.qvel_path, mask)
-        if mask is None:
-            self._derive()
-        else:
-            self._mask.copy_(mask)
-            self._derive_masked()
+        self._derive(mask)
 
     def reset_robot(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
         """Put the robots of ``mask`` (N,) bool into state qpos (N, 28), qvel (N, 27) and draw their parameters anew."""
@@ -283,26 +270,14 @@ class Worlds:
         self.engine.apply_params(mask)
         self.engine.reset(mask, qpos, qvel)
         self._observe(mask)
-        self._stand()
+        self._stand(mask)
 
     def serve(self, mask: Tensor, position: Tensor, velocity: Tensor, spin: Tensor) -> None:
         """Start the ball of the worlds of ``mask`` at position (N, 3) m, velocity (N, 3) m/s, spin (N, 3) rad/s.
 
         Give the same tensors each time: others are bound anew, which takes longer.
         """
-        given = (position, velocity, spin)
-        if any(tensor is not bound for tensor, bound in zip(given, self._launch, strict=True)):
-            self._bind_launch(given)
-        self._mask.copy_(mask)
-        self._serve()
-
-    def _bind_launch(self, launch: tuple[Tensor, Tensor, Tensor]) -> None:
-        for name, state in zip(("position", "velocity", "spin"), launch, strict=True):
-            require_shape(name, state, (self.num_worlds, 3))
-        self._launch = launch
-        ball = (self.ball.position, self.ball.velocity, self.ball.spin)
-        tensors = [wp.from_torch(tensor) for tensor in (*launch, *ball)]
-        self._serve = record(_launch_ball, self.num_worlds, [share(self._mask), *tensors], self.device)
+        self._serve(position, velocity, spin)(mask)
 
     def warn_of_overflow(self) -> None:
         """Warn, once, when a world ever had more contacts or constraints than there is room for: the engine has dropped
@@ -319,22 +294,23 @@ class Worlds:
             stacklevel=2,
         )
 
-    def state_dict(self) -> dict[str, Tensor]:
+    def state_tensors(self) -> dict[str, Tensor]:
         """All that the next control step depends on, besides the random generator."""
-        events = {f"event.{f.name}": getattr(self.ball.events, f.name) for f in fields(self.ball.events)}
-        ball = {"position": self.ball.position, "velocity": self.ball.velocity, "spin": self.ball.spin}
-        drawn = with_prefix("drawn", self.randomizer.state_dict())
-        engine = with_prefix("engine", self.engine.state_dict())
-        return ball | events | drawn | engine | {"previous_targets": self._previous_targets}
+        drawn = with_prefix("drawn", self.randomizer.state_tensors())
+        return self._own_tensors() | drawn | with_prefix("engine", self.engine.state_tensors())
 
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+    def _own_tensors(self) -> dict[str, Tensor]:
+        ball = tensors_named(self.ball, ("position", "velocity", "spin"))
+        events = with_prefix("event", named_tensors(self.ball.events))
+        return ball | events | {"previous_targets": self._previous_targets}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Put back what :meth:`state_dict` returned."""
         self.randomizer.load_state_dict(under_prefix("drawn", state))
         self._update_delay()
         everyone = torch.ones(self.num_worlds, dtype=torch.bool, device=self.device)
         self.engine.apply_params(everyone)
         self.engine.load_state_dict(under_prefix("engine", state))
-        for name, tensor in self.state_dict().items():
-            if not name.startswith(("drawn.", "engine.")):
-                tensor.copy_(state[name])
+        for name, tensor in self._own_tensors().items():
+            tensor.copy_(state[name])
         self._observe()

@@ -13,7 +13,7 @@ from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from pace.arrays.graph import CapturedCall, graphs_wanted
-from pace.arrays.state import restore, snapshot, under_prefix, with_prefix
+from pace.arrays.state import Stateful, tensors_named, under_prefix, with_prefix
 from pace.config.base import ConfigError
 from pace.config.task import TaskConfig
 from pace.sim.sensing import Sensing
@@ -36,6 +36,29 @@ from pace.task.statistics import Statistics
 
 #: The environment's own part of its state; the rest belongs to its parts.
 OWN_TENSORS = ("predictor_target", "predictor_time_to_apex", "_bad")
+#: State of what the robot computes on board and of the histories, which do not declare it themselves.
+ONBOARD_STATE = {
+    "memory": ("state",),
+    "delay": ("state",),
+    "attitude": ("state", "quat"),
+    "joints": ("state",),
+    "track": ("positions", "turned", "something_to_hit"),
+    "actor": (
+        "_base_quat",
+        "_joints",
+        "_nominal",
+        "action",
+        "apex",
+        "paddle_normal",
+        "paddle_position",
+        "prediction",
+        "shift",
+        "target",
+        "time",
+    ),
+    "policy": ("frame", "observation"),
+    "critic": ("frame", "observation"),
+}
 
 
 class TableTennisEnv(EnvBase):
@@ -176,7 +199,7 @@ class TableTennisEnv(EnvBase):
         self.rewards.compute(self.task_state)
         next_serve = self.game.ends.next_serve
         self.statistics.add()
-        self.game.clock.finish(self.serve_over)
+        self.game.count_serves()
         self._start_serves(next_serve)
         self.sensing.update(self.worlds.robot, self.worlds.ball.position, next_serve)
         self.actor.track.update(self.sensing.ball_position, next_serve)
@@ -199,7 +222,7 @@ class TableTennisEnv(EnvBase):
     def _begin_episodes(self, mask: Tensor) -> None:
         qpos, qvel = self._poses.sample(mask)
         self.worlds.reset_robot(mask, qpos, qvel)
-        self.game.clock.start_episode(mask, self.generator)
+        self.game.start_episode(mask, self.generator)
         self._start_serves(mask, self._head_start)
         for action in (self.task_state.action, self.task_state.previous_action):
             action.masked_fill_(mask.unsqueeze(-1), 0.0)
@@ -272,30 +295,36 @@ class TableTennisEnv(EnvBase):
         sums["reward_sum"] = torch.stack(list(terms.values())).sum()
         return sums | {f"reward/{name}": value for name, value in terms.items()}
 
-    def _parts(self) -> dict[str, object]:
-        kept = {name: getattr(self.actor, name) for name in ("memory", "delay", "attitude", "joints")}
-        return {name: part for name, part in kept.items() if part is not None} | {
+    def _parts(self) -> dict[str, Stateful]:
+        return {
+            "worlds": self.worlds,
+            "game": self.game,
             "state": self.task_state,
             "sensing": self.sensing,
-            "track": self.actor.track,
-            "actor": self.actor,
-            "policy": self._policy_history,
-            "critic": self._critic_history,
             "rewards": self.rewards,
             "statistics": self.statistics,
         }
+
+    def _own_state(self) -> dict[str, Tensor]:
+        """What belongs to no part that declares its state."""
+        actor = self.actor
+        kept = {name: getattr(actor, name) for name in ("memory", "delay", "attitude", "joints", "track")}
+        kept |= {"actor": actor, "policy": self._policy_history, "critic": self._critic_history}
+        state = with_prefix("env", tensors_named(self, OWN_TENSORS))
+        for name, part in kept.items():
+            if part is not None:
+                state |= with_prefix(name, tensors_named(part, ONBOARD_STATE[name]))
+        return state
 
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:  # type: ignore[override]
         """Everything that the next step depends on, as copies: tensors by name, and ``generator``.
 
         The predictor's weights are not part of it: they belong to whoever made it.
         """
-        state = with_prefix("worlds", {name: value.clone() for name, value in self.worlds.state_dict().items()})
-        state |= with_prefix("game", self.game.state_dict())
+        state = {name: tensor.clone() for name, tensor in self._own_state().items()}
         for name, part in self._parts().items():
-            state |= with_prefix(name, snapshot(part))
-        own = {f"env.{name}": getattr(self, name).clone() for name in OWN_TENSORS}
-        return state | own | {"generator": self.generator.get_state()}
+            state |= with_prefix(name, part.state_dict())
+        return state | {"generator": self.generator.get_state()}
 
     def load_state_dict(self, state_dict: dict[str, Any], *args: Any, **kwargs: Any) -> None:  # type: ignore[override]
         """Put back what :meth:`state_dict` returned; the next step is then the same, bit for bit (but for MuJoCo
@@ -303,12 +332,10 @@ class TableTennisEnv(EnvBase):
 
         Errors: ``KeyError`` for a missing tensor, ``RuntimeError`` for another shape (number of worlds, layout).
         """
-        self.worlds.load_state_dict(under_prefix("worlds", state_dict))
-        self.game.load_state_dict(under_prefix("game", state_dict))
         for name, part in self._parts().items():
-            restore(part, under_prefix(name, state_dict))
-        for name in OWN_TENSORS:
-            getattr(self, name).copy_(state_dict[f"env.{name}"])
+            part.load_state_dict(under_prefix(name, state_dict))
+        for name, tensor in self._own_state().items():
+            tensor.copy_(state_dict[name])
         self.generator.set_state(state_dict["generator"].cpu())
 
     # --- TorchRL ------------------------------------------------------------------------------------------------------

@@ -2,7 +2,8 @@
 
 import warp as wp
 
-from pace.sim.ball.kernels import EventArrays, ForecastArrays
+from pace.sim.ball.events import EventArrays, ForecastArrays
+from pace.task.game_state import GameArrays
 from pace.task.outcome import Outcome
 
 OPEN = wp.constant(int(Outcome.OPEN))
@@ -42,44 +43,6 @@ class Rules:
     moved: float  # what a sensed ball must have moved to have turned
 
 
-@wp.struct
-class GameArrays:
-    """The tensors of :class:`pace.task.game.Game`."""
-
-    own_bounces: wp.array[wp.int32]
-    outcome: wp.array[wp.int32]
-    hit: wp.array[wp.bool]
-    touched: wp.array[wp.bool]
-    rim: wp.array[wp.bool]
-    net_touched: wp.array[wp.bool]
-    was_open: wp.array[wp.bool]
-    hit_now: wp.array[wp.bool]
-    success_now: wp.array[wp.bool]
-    touch_time: wp.array[wp.float32]
-    playable: wp.array[wp.bool]
-    apex: wp.array[wp.vec3]
-    apex_time: wp.array[wp.float32]
-    point: wp.array[wp.vec3]
-    target_time: wp.array[wp.float32]
-    something_to_hit: wp.array[wp.bool]
-    landing: wp.array[wp.vec3]
-    net_height: wp.array[wp.float32]
-    lands_own: wp.array[wp.bool]
-    lands_opponent: wp.array[wp.bool]
-    nearest: wp.array[wp.float32]
-    previous: wp.array[wp.float32]
-    arrived: wp.array[wp.bool]
-    arrived_now: wp.array[wp.bool]
-    time: wp.array[wp.float32]
-    index: wp.array[wp.float32]
-    lost: wp.array[wp.bool]
-    truncated: wp.array[wp.bool]
-    over: wp.array[wp.bool]
-    next_serve: wp.array[wp.bool]
-    ended_outcome: wp.array[wp.int32]
-    ended_hit: wp.array[wp.bool]
-
-
 @wp.func
 def nothing_to_hit(position: wp.vec3, velocity: wp.vec3, rules: Rules) -> bool:
     """A ball that is past the robot, moves away, is too low, or falls behind the table cannot be hit any more."""
@@ -95,7 +58,7 @@ def clamp_x(point: wp.vec3, largest: float) -> wp.vec3:
 
 @wp.func
 def something_to_hit_now(game: GameArrays, position: wp.vec3, velocity: wp.vec3, rules: Rules, world: int) -> bool:
-    undecided = game.outcome[world] == OPEN and not game.touched[world]
+    undecided = game.referee.outcome[world] == OPEN and not game.referee.touched[world]
     return undecided and not nothing_to_hit(position, velocity, rules)
 
 
@@ -134,24 +97,24 @@ def _judge_flight(
     first = wp.min(wp.min(opponent, off_table), wp.min(own, again))
     net = _after(events.net_time[world], since)
     if net < wp.inf and net <= first:
-        game.net_touched[world] = True
+        game.referee.net_touched[world] = True
     if first == wp.inf:
         return OPEN
     if again == first and opponent > first and own > first:
         return DOUBLE_HIT
-    return _landed(opponent == first, own == first, game.net_touched[world], x)
+    return _landed(opponent == first, own == first, game.referee.net_touched[world], x)
 
 
 @wp.kernel
 def judge(game: GameArrays, events: EventArrays, position: wp.array[wp.vec3]):
     """The referee: consume the events of one control step in the order of their times."""
     world = wp.tid()
-    was_open = game.outcome[world] == OPEN
-    hit_before = game.hit[world]
+    was_open = game.referee.outcome[world] == OPEN
+    hit_before = game.referee.hit[world]
     touch = events.paddle_hit_time[world]
     struck = events.paddle_hit[world] > 0
     bounce_first = events.own_bounce_time[world] < touch
-    before = game.own_bounces[world]
+    before = game.referee.own_bounces[world]
     if not struck:
         before += events.own_bounce[world]
     elif bounce_first:
@@ -159,7 +122,7 @@ def judge(game: GameArrays, events: EventArrays, position: wp.array[wp.vec3]):
     dead = wp.min(events.floor_time[world], events.edge_time[world])
     lost = before >= 2 or dead < touch
     hit_now = was_open and not hit_before and struck and not lost and before == 1
-    outcome = game.outcome[world]
+    outcome = game.referee.outcome[world]
     if was_open and not hit_before:
         if lost:
             outcome = MISS
@@ -176,40 +139,44 @@ def judge(game: GameArrays, events: EventArrays, position: wp.array[wp.vec3]):
                 own_count -= 1
         outcome = _judge_flight(game, events, world, since, own_count, touches, dead, position[world][0])
     if hit_now:
-        game.hit[world] = True
-        game.rim[world] = events.hit_rim[world]
-    if struck and not game.touched[world]:
-        game.touched[world] = True
-        game.touch_time[world] = game.time[world] + touch
-    game.was_open[world] = was_open
-    game.hit_now[world] = hit_now
-    game.outcome[world] = outcome
-    game.own_bounces[world] += events.own_bounce[world]
+        game.referee.hit[world] = True
+        game.referee.rim[world] = events.hit_rim[world]
+    if struck and not game.referee.touched[world]:
+        game.referee.touched[world] = True
+        game.referee.touch_time[world] = game.clock.time[world] + touch
+    game.referee.was_open[world] = was_open
+    game.referee.hit_now[world] = hit_now
+    game.referee.outcome[world] = outcome
+    game.referee.own_bounces[world] += events.own_bounce[world]
 
 
 @wp.func
 def _take_return(game: GameArrays, forecast: ForecastArrays, world: int):
     """Keep the forecast of a ball that was just hit."""
-    game.landing[world] = forecast.landing[world]
-    game.net_height[world] = forecast.net_height[world]
-    game.lands_own[world] = forecast.landing_own[world]
-    game.lands_opponent[world] = forecast.landing_opponent[world]
+    game.returns.landing[world] = forecast.landing[world]
+    game.returns.net_height[world] = forecast.net_height[world]
+    game.returns.lands_own[world] = forecast.landing_own[world]
+    game.returns.lands_opponent[world] = forecast.landing_opponent[world]
 
 
 @wp.func
 def _approach(game: GameArrays, world: int, distance: float):
     """Smallest distance while the ball can be hit legally, and whether it has now been hit or come to its target."""
-    hit_now = game.hit_now[world]
-    in_play = game.was_open[world] and game.own_bounces[world] >= 1 and (hit_now or not game.touched[world])
-    nearest = game.nearest[world]
-    game.previous[world] = nearest
+    hit_now = game.referee.hit_now[world]
+    in_play = (
+        game.referee.was_open[world]
+        and game.referee.own_bounces[world] >= 1
+        and (hit_now or not game.referee.touched[world])
+    )
+    nearest = game.closeness.nearest[world]
+    game.closeness.previous[world] = nearest
     if in_play:
-        game.nearest[world] = wp.min(nearest, distance)
-    due = hit_now or game.time[world] >= game.target_time[world]
-    arrived_now = in_play and due and not game.arrived[world]
-    game.arrived_now[world] = arrived_now
+        game.closeness.nearest[world] = wp.min(nearest, distance)
+    due = hit_now or game.clock.time[world] >= game.target.time[world]
+    arrived_now = in_play and due and not game.closeness.arrived[world]
+    game.closeness.arrived_now[world] = arrived_now
     if arrived_now:
-        game.arrived[world] = True
+        game.closeness.arrived[world] = True
 
 
 @wp.func
@@ -223,8 +190,8 @@ def _lost(base: wp.vec3, rules: Rules) -> bool:
 @wp.func
 def _over(game: GameArrays, rules: Rules, world: int, height: float, on_floor: bool) -> bool:
     """The serve ends: ball low or on the floor, time up, or long enough after the contact."""
-    time = game.time[world]
-    late = rules.end_after_hit > 0.0 and time >= game.touch_time[world] + rules.end_after_hit
+    time = game.clock.time[world]
+    late = rules.end_after_hit > 0.0 and time >= game.referee.touch_time[world] + rules.end_after_hit
     return height < rules.end_height or on_floor or time >= rules.max_duration or late
 
 
@@ -242,31 +209,36 @@ def close(
 ):
     """After :func:`judge`: clock, forecast of a hit, approach of the paddle, ends of serves and episodes."""
     world = wp.tid()
-    game.time[world] += rules.control_dt
-    if game.hit_now[world]:
+    game.clock.time[world] += rules.control_dt
+    if game.referee.hit_now[world]:
         _take_return(game, forecast, world)
     _approach(game, world, paddle_distance[world] - radius[world])
     lost = _lost(base_position[world], rules)
     over = _over(game, rules, world, position[world][2], events.floor[world] > 0)
-    outcome = game.outcome[world]
+    outcome = game.referee.outcome[world]
     if outcome == OPEN:
         if lost:
             outcome = FALL
-        elif over and game.hit[world]:
-            landing_x = game.landing[world][0]
-            outcome = _landed(game.lands_opponent[world], game.lands_own[world], game.net_touched[world], landing_x)
+        elif over and game.referee.hit[world]:
+            landing_x = game.returns.landing[world][0]
+            outcome = _landed(
+                game.returns.lands_opponent[world],
+                game.returns.lands_own[world],
+                game.referee.net_touched[world],
+                landing_x,
+            )
         elif over:
             outcome = MISS
-    game.outcome[world] = outcome
-    game.success_now[world] = game.was_open[world] and outcome == SUCCESS
-    game.lost[world] = lost
-    game.over[world] = over or lost
-    game.next_serve[world] = over and not lost
-    last = rules.serves_per_episode > 0 and game.index[world] + 1.0 >= float(rules.serves_per_episode)
-    game.truncated[world] = over and last and not lost
-    game.ended_outcome[world] = outcome
-    game.ended_hit[world] = game.hit[world]
-    game.something_to_hit[world] = something_to_hit_now(game, position[world], velocity[world], rules, world)
+    game.referee.outcome[world] = outcome
+    game.referee.success_now[world] = game.referee.was_open[world] and outcome == SUCCESS
+    game.ends.lost[world] = lost
+    game.ends.over[world] = over or lost
+    game.ends.next_serve[world] = over and not lost
+    last = rules.serves_per_episode > 0 and game.clock.index[world] + 1.0 >= float(rules.serves_per_episode)
+    game.ends.truncated[world] = over and last and not lost
+    game.ends.outcome[world] = outcome
+    game.ends.hit[world] = game.referee.hit[world]
+    game.target.something_to_hit[world] = something_to_hit_now(game, position[world], velocity[world], rules, world)
 
 
 @wp.func
@@ -278,17 +250,17 @@ def _aim(game: GameArrays, forecast: ForecastArrays, rules: Rules, world: int):
     if playable:
         apex = forecast.apex[world]
         time = forecast.apex_time[world]
-    game.playable[world] = playable
-    game.apex[world] = apex
-    game.apex_time[world] = time
+    game.target.playable[world] = playable
+    game.target.apex[world] = apex
+    game.target.apex_time[world] = time
     if rules.intercept == 0:
-        game.point[world] = clamp_x(apex, rules.target_x)
+        game.target.point[world] = clamp_x(apex, rules.target_x)
     elif playable and not wp.isnan(forecast.intercept_time[world]):
-        game.point[world] = forecast.intercept[world]
+        game.target.point[world] = forecast.intercept[world]
         time = forecast.intercept_time[world]
     else:
-        game.point[world] = apex
-    game.target_time[world] = time
+        game.target.point[world] = apex
+    game.target.time[world] = time
 
 
 @wp.kernel
@@ -298,7 +270,6 @@ def start_serve(
     forecast: ForecastArrays,
     position: wp.array[wp.vec3],
     velocity: wp.array[wp.vec3],
-    arriving: wp.array[wp.vec3],
     rules: Rules,
 ):
     """Begin the serve whose flight was forecast, in the masked worlds."""
@@ -306,24 +277,24 @@ def start_serve(
     if not mask[world]:
         return
     _aim(game, forecast, rules, world)
-    arriving[world] = wp.vec3(0.0)
-    if game.playable[world] and not wp.isnan(forecast.intercept_time[world]):
-        arriving[world] = forecast.intercept_velocity[world]
+    game.target.arriving[world] = wp.vec3(0.0)
+    if game.target.playable[world] and not wp.isnan(forecast.intercept_time[world]):
+        game.target.arriving[world] = forecast.intercept_velocity[world]
     outcome = int(BAD_SERVE)
-    if game.playable[world]:
+    if game.target.playable[world]:
         outcome = OPEN
-    game.outcome[world] = outcome
-    game.time[world] = 0.0
-    game.own_bounces[world] = 0
-    game.hit[world] = False
-    game.touched[world] = False
-    game.rim[world] = False
-    game.net_touched[world] = False
-    game.touch_time[world] = wp.inf
-    game.nearest[world] = wp.inf
-    game.previous[world] = wp.inf
-    game.arrived[world] = False
-    game.something_to_hit[world] = something_to_hit_now(game, position[world], velocity[world], rules, world)
+    game.referee.outcome[world] = outcome
+    game.clock.time[world] = 0.0
+    game.referee.own_bounces[world] = 0
+    game.referee.hit[world] = False
+    game.referee.touched[world] = False
+    game.referee.rim[world] = False
+    game.referee.net_touched[world] = False
+    game.referee.touch_time[world] = wp.inf
+    game.closeness.nearest[world] = wp.inf
+    game.closeness.previous[world] = wp.inf
+    game.closeness.arrived[world] = False
+    game.target.something_to_hit[world] = something_to_hit_now(game, position[world], velocity[world], rules, world)
 
 
 @wp.kernel

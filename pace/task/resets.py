@@ -7,7 +7,7 @@ import warp as wp
 from torch import Tensor
 
 from pace.arrays.draws import Column, Draws, columns_of
-from pace.arrays.share import record, share
+from pace.arrays.launch import Launch
 from pace.config.sim import RobotConfig
 from pace.config.task import ResetConfig, ServeConfig
 from pace.sim.ball.ball import BallSim
@@ -82,7 +82,7 @@ class PoseSampler:
         ranges = _joint_ranges(config, joint_names, nominal.tolist())
         columns += columns_of(self._qpos[:, 7:], [(*pair, *end) for pair, end in zip(ranges, ends, strict=True)])
         self._draw = Draws(columns, generator)
-        self._turn = record(turn, num_worlds, [share(yaw), wp.from_torch(self._qpos)], device)
+        self._turn = Launch(turn, num_worlds, device, yaw=yaw, qpos=self._qpos)
 
     def sample(self, mask: Tensor) -> tuple[Tensor, Tensor]:
         """qpos (N, 7 + J) and qvel (N, 6 + J) of MuJoCo; joints within their limits and at rest.

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from pace.arrays.state import Stateful
 from pace.config.base import ConfigError
 from pace.config.task import RewardConfig
 from pace.sim.ball.aero import GRAVITY
@@ -355,7 +356,7 @@ class _Entry:
     params: dict[str, float]
 
 
-class RewardManager:
+class RewardManager(Stateful):
     """Computes the reward of N worlds and keeps each term's sum.
 
     Attributes: ``names`` of the T terms, ``values`` (T, N) unweighted, ``reward`` (N,) as the learner sees it,
@@ -363,6 +364,8 @@ class RewardManager:
 
     Errors: :class:`ConfigError` for an unknown term, or a missing or unknown parameter.
     """
+
+    STATE = ("_weights", "values", "reward", "sums")
 
     def __init__(self, config: RewardConfig, num_worlds: int, device: torch.device, control_dt: float) -> None:
         for name, entry in config.terms.items():

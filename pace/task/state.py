@@ -6,17 +6,20 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import torch
-import warp as wp
 from torch import Tensor
 
-from pace.arrays.share import record, share, share_all
+from pace.arrays.launch import Launch
+from pace.arrays.state import Stateful
+from pace.arrays.tensors import allocate
 from pace.sim.robot import RIGHT_ARM
 from pace.task.game import Game
-from pace.task.state_kernels import DerivedArrays, JointArrays, Measures, RobotArrays, derive, measure
+from pace.task.measures import Derived, Measures
+from pace.task.state_kernels import derive, measure
 
 if TYPE_CHECKING:
     from pace.sim.ball.ball import BallSim
-    from pace.sim.worlds import RobotState, Worlds
+    from pace.sim.robot_state import RobotState
+    from pace.sim.worlds import Worlds
 
 
 def _is_hip_waist_left_arm(name: str) -> bool:
@@ -33,71 +36,78 @@ JOINT_GROUPS: dict[str, Callable[[str], bool]] = {
 }
 
 
-class TaskState:
+class TaskState(Derived, Stateful):
     """True state of the task after a control step. Privileged: the actor never reads it.
 
-    Attributes: ``robot``, ``ball`` (simulation), ``game`` (rules and forecast), ``action`` and ``previous_action``
-    (N, J); ``mocap_delay`` (N,) control steps by which motion capture is late; ``nominal`` (J,) rad, ``joint_range``
-    the middle of the joints' ranges and the way from there to their ends, (J,) rad each.
-    After :meth:`refresh`: ``measures`` name -> (N,) as its kernel computes them: ``joint_power`` and ``ankle_power`` W,
-    norms over the joints of torque times velocity; ``joint_acceleration`` (rad/s^2)^2 and ``action_change``, sums of
-    squares; the sum of |joint - nominal| over each other group of :data:`JOINT_GROUPS`, rad; ``foot_tilt``, squared
-    horizontal part of the soles' normals, ``foot_slide`` m/s, horizontal speed of the feet in contact, both summed;
-    ``foot_steepness``, the largest horizontal over vertical force of a foot in contact; ``feet_down``, number of feet
-    in contact; ``contacts``, of other bodies; ``paddle_to_head``, ``paddle_to_target``, ``base_to_target`` m; squares
-    of the base's motion: ``vertical_velocity`` (m/s)^2, ``roll_pitch_rate``, ``yaw_rate`` (rad/s)^2; ``base_tilt``,
-    squared horizontal part of gravity in the body frame.
-    Also what :meth:`derive` computes:
-    ``something_to_hit`` (N,) bool; ``apex``, ``target`` (N, 3) m, the point to stand by where there is nothing to hit;
-    ``arrival`` (N,) s until the ball is at the target, 0 where there is nothing to hit; ``base_error``, ``shift``
-    (N, 2) m from the base to where it should stand, for the rewards and as the networks see it; ``foot_load``
-    (N, 2) N, ``foot_contact`` (N, 2) bool, ``feet_distance`` (N,) m; ``paddle_to_target`` (N, 3) m; ``joint_offset``
-    (N, J) rad from the nominal pose; ``serve_progress`` (N,), share of the longest serve, and ``episode_progress``
-    (N,), share of the episode's serves, 0 where episodes do not end.
+    Attributes, besides those of :class:`Derived`: ``robot``, ``ball`` (simulation), ``game`` (rules and forecast),
+    ``action`` and ``previous_action`` (N, J); ``mocap_delay`` (N,) control steps by which motion capture is late;
+    ``nominal`` (J,) rad, ``joint_range`` the middle of the joints' ranges and the way from there to their ends, (J,)
+    rad each; ``something_to_hit``, ``lost`` (N,) bool. After :meth:`refresh`: ``measures``, those of
+    :class:`Measures` by name.
     """
 
+    STATE = (
+        "action",
+        "previous_action",
+        "nominal",
+        "mocap_delay",
+        "lost",
+        "something_to_hit",
+        "base_error",
+        "shift",
+        "apex",
+        "target",
+        "arrival",
+        "foot_load",
+        "foot_contact",
+        "feet_distance",
+    )
+
     def __init__(self, worlds: Worlds, game: Game, mocap_delay: Tensor) -> None:
+        count, joints, device = worlds.num_worlds, worlds.nominal.shape[0], worlds.device
+        super().__init__(**vars(allocate(Derived, count, device, joints=joints, feet=2)))
         self.robot: RobotState = worlds.robot
         self.ball: BallSim = worlds.ball
-        self.game = game
+        self.game, self.mocap_delay = game, mocap_delay
         self.nominal, lower, upper = worlds.nominal, worlds.joint_lower, worlds.joint_upper
         self.joint_range = 0.5 * (upper + lower), 0.5 * (upper - lower)
-        count, joints, device = worlds.num_worlds, worlds.nominal.shape[0], worlds.device
         self.action = torch.zeros(count, joints, device=device)
         self.previous_action = torch.zeros(count, joints, device=device)
         self.lost, self.something_to_hit = game.ends.lost, game.target.something_to_hit
-        self.measures = {name: torch.zeros(count, device=device) for name in Measures.vars}  # type: ignore[attr-defined]
-        self._allocate(count, device)
+        self.measures: dict[str, Tensor] = vars(allocate(Measures, count, device))
         self._record(worlds)
-        self.mocap_delay = mocap_delay
-
-    def _allocate(self, count: int, device: torch.device) -> None:
-        self.base_error, self.shift = torch.zeros(count, 2, device=device), torch.zeros(count, 2, device=device)
-        self.apex, self.target = torch.zeros(count, 3, device=device), torch.zeros(count, 3, device=device)
-        self.arrival = torch.zeros(count, device=device)
-        self.foot_load = torch.zeros(count, 2, device=device)
-        self.foot_contact = torch.zeros(count, 2, dtype=torch.bool, device=device)
-        self.feet_distance = torch.zeros(count, device=device)
-        shown = torch.zeros(count, 5 + self.action.shape[1], device=device)  # to the critic; not part of the state
-        self.paddle_to_target, self.joint_offset = shown[:, :3], shown[:, 5:]
-        self.serve_progress, self.episode_progress = shown[:, 3], shown[:, 4]
 
     def _record(self, worlds: Worlds) -> None:
-        ball, robot = self.ball, self.robot
-        seen = (ball.position, ball.velocity, robot.base_position, robot.paddle_position)
-        seen += (robot.joint_position, self.nominal, robot.foot_force, robot.foot_position)
-        derived = share_all(DerivedArrays, vars(self))
-        inputs = [self.game.arrays(), derived, *(share(tensor) for tensor in seen), self.game.rules]
-        self._derive = record(derive, worlds.num_worlds, inputs, worlds.device)
-        self._joints = {"nominal": self.nominal} | {
-            group: torch.tensor([float(belongs(name)) for name in worlds.joint_names], device=worlds.device)
+        ball, game, count, device = self.ball, self.game, worlds.num_worlds, worlds.device
+        self._derive = Launch(
+            derive,
+            count,
+            device,
+            game=game,
+            derived=self,
+            position=ball.position,
+            velocity=ball.velocity,
+            robot=self.robot,
+            nominal=self.nominal,
+            rules=game.rules,
+        )
+        groups = {
+            group: torch.tensor([float(belongs(name)) for name in worlds.joint_names], device=device)
             for group, belongs in JOINT_GROUPS.items()
         }
-        actions = {"action": self.action, "previous_action": self.previous_action}
-        measured = share_all(RobotArrays, vars(robot) | actions)
-        arrays = [share_all(JointArrays, self._joints), share(self.foot_contact), share(self.game.target.point)]
-        arrays += [wp.from_torch(self.base_error, dtype=wp.vec2), share_all(Measures, self.measures)]
-        self._measure = record(measure, worlds.num_worlds, [measured, *arrays], worlds.device)
+        self._measure = Launch(
+            measure,
+            count,
+            device,
+            robot=self.robot,
+            action=self.action,
+            previous_action=self.previous_action,
+            joints=groups | {"nominal": self.nominal},
+            foot_contact=self.foot_contact,
+            point=game.target.point,
+            base_error=self.base_error,
+            measures=self.measures,
+        )
 
     def refresh(self) -> None:
         """Compute all shared quantities from the robot's and the ball's new state."""

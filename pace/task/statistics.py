@@ -6,8 +6,11 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from pace.arrays.share import record, share
-from pace.task.game import Game, Outcome
+from pace.arrays.launch import Launch
+from pace.arrays.state import Stateful
+from pace.task.game import Game
+from pace.task.game_state import GameArrays
+from pace.task.outcome import Outcome
 
 #: Outcomes that serves are counted by; ``outcome/success`` and the others add up to ``serves``.
 COUNTED = tuple(outcome for outcome in Outcome if outcome not in (Outcome.OPEN, Outcome.BAD_SERVE))
@@ -30,41 +33,32 @@ SUCCESS, BAD_SERVE = wp.constant(int(Outcome.SUCCESS)), wp.constant(int(Outcome.
 
 
 @wp.kernel
-def _count(
-    over: wp.array[wp.bool],
-    outcome: wp.array[wp.int32],
-    hit: wp.array[wp.bool],
-    rim: wp.array[wp.bool],
-    lost: wp.array[wp.bool],
-    truncated: wp.array[wp.bool],
-    played: wp.array[wp.float32],
-    first_counted: wp.array[wp.float32],
-    sums: wp.array[wp.float32],
-):
+def _count(game: GameArrays, first_counted: wp.array[wp.float32], sums: wp.array[wp.float32]):
     """Count one world's step. The sums are whole numbers, so the order in which worlds add to them does not matter."""
     world = wp.tid()
     if world == 0:
-        wp.atomic_add(sums, STEPS, float(over.shape[0]))
-    if lost[world]:
+        wp.atomic_add(sums, STEPS, float(game.ends.over.shape[0]))
+    if game.ends.lost[world]:
         wp.atomic_add(sums, FALLS, 1.0)
-    if lost[world] or truncated[world]:
+    if game.ends.lost[world] or game.ends.truncated[world]:
         wp.atomic_add(sums, EPISODES, 1.0)
-    if not over[world] or played[world] < first_counted[0]:
+    if not game.ends.over[world] or game.clock.played[world] < first_counted[0]:
         return
-    if outcome[world] == BAD_SERVE:
+    outcome = game.ends.outcome[world]
+    if outcome == BAD_SERVE:
         wp.atomic_add(sums, BAD_SERVES, 1.0)
         return
     wp.atomic_add(sums, SERVES, 1.0)
-    wp.atomic_add(sums, OUTCOMES + outcome[world], 1.0)
-    if outcome[world] == SUCCESS:
+    wp.atomic_add(sums, OUTCOMES + outcome, 1.0)
+    if outcome == SUCCESS:
         wp.atomic_add(sums, SUCCESSES, 1.0)
-    if hit[world]:
+    if game.referee.hit[world]:
         wp.atomic_add(sums, HITS, 1.0)
-        if rim[world]:
+        if game.referee.rim[world]:
             wp.atomic_add(sums, RIM_HITS, 1.0)
 
 
-class Statistics:
+class Statistics(Stateful):
     """Sums over worlds and control steps since the last :meth:`pop`.
 
     ``serves`` that ended, without ``bad_serves``; ``hits``, ``rim_hits`` and ``successes`` among them; their
@@ -72,13 +66,14 @@ class Statistics:
     at their end, and not while a world plays its first ``env.warmup_serves``.
     """
 
+    STATE = ("sums",)
+
     def __init__(self, game: Game, first_counted: Tensor) -> None:
         """Of ``game``, where a world's serves count from number ``first_counted`` (0-d) on."""
-        ends, played = game.ends, game.clock.played
+        played = game.clock.played
         self.sums = torch.zeros(len(NAMES), device=played.device)
-        tensors = (ends.over, ends.outcome, game.referee.hit, game.referee.rim, ends.lost, ends.truncated, played)
-        inputs = [share(tensor) for tensor in (*tensors, first_counted.view(1), self.sums)]
-        self._count = record(_count, len(played), inputs, played.device)
+        first = first_counted.view(1)
+        self._count = Launch(_count, len(played), played.device, game=game, first_counted=first, sums=self.sums)
 
     def add(self) -> None:
         """Count the control step that was just judged, before the clock counts its serves."""

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pace.arrays.tensors import allocate
 from pace.config.task import TaskConfig
 from pace.config.training import load_train_config
 from pace.sim.ball.ball import BallEvents, Forecast
@@ -51,11 +52,11 @@ def set_serve(forecast: Forecast) -> None:
 
 def fake_ball(n: int) -> Any:
     """A ball in mid-serve, without a physics; far from the paddle."""
-    forecast = Forecast.allocate(n, CPU)
+    forecast = allocate(Forecast, n, CPU)
     set_serve(forecast)
     return SimpleNamespace(
         num_worlds=n, device=CPU, position=torch.tensor([0.5, 0.0, 1.1]).repeat(n, 1),
-        velocity=torch.tensor([-5.0, 0.1, 0.5]).repeat(n, 1), events=BallEvents.allocate(n, CPU),
+        velocity=torch.tensor([-5.0, 0.1, 0.5]).repeat(n, 1), events=allocate(BallEvents, n, CPU),
         forecast_result=forecast, nearest_paddle_distance=torch.ones(n),
         params=SimpleNamespace(radius=torch.full((n,), 0.02)),
     )  # fmt: skip

@@ -133,5 +133,5 @@ def test_wrong_shapes_and_order_are_clear_errors(model):
     kinematics = Kinematics(model, WORLDS, SUBSTEPS, "cpu")
     with pytest.raises(RuntimeError, match="call update"):
         kinematics.paddle_generalized_force(torch.zeros(WORLDS, 3), torch.zeros(WORLDS, 3), torch.zeros(WORLDS, 27))
-    with pytest.raises(ValueError, match=r"qpos_path must be \(6, 4, 28\)"):
+    with pytest.raises(ValueError, match=r"qpos_path must have shape \(6, 4, 28\)"):
         kinematics.update(torch.zeros(WORLDS, 2, 28), torch.zeros(WORLDS, 2, 27))

@@ -353,14 +353,14 @@ def test_episodes_count_five_serves_and_first_ones_start_anywhere() -> None:
     clock = game.clock
     everyone = torch.ones(1000, dtype=torch.bool)
     generator = torch.Generator().manual_seed(0)
-    clock.start_episode(everyone, generator)
+    game.start_episode(everyone, generator)
     assert set(clock.index.tolist()) == {0.0, 1.0, 2.0, 3.0, 4.0}
     worlds.ball.position[:, 2] = 0.05
     game.close()
     torch.testing.assert_close(game.ends.truncated, clock.index == 4)
-    clock.start_episode(everyone, generator)
+    game.start_episode(everyone, generator)
     assert not clock.index.any()
-    clock.finish(everyone)
+    game.count_serves()  # all are over
     clock.time.fill_(0.9)
     state = TaskState(worlds, game, torch.zeros(worlds.num_worlds))
     state.derive()
@@ -370,7 +370,7 @@ def test_episodes_count_five_serves_and_first_ones_start_anywhere() -> None:
 
 def test_endless_play_has_no_last_serve() -> None:
     game, worlds = fake_game(3, config("serve=mixed"))
-    game.clock.start_episode(torch.ones(3, dtype=torch.bool), torch.Generator())
+    game.start_episode(torch.ones(3, dtype=torch.bool), torch.Generator())
     assert not game.clock.index.any()
     game.clock.index.fill_(1000.0)
     worlds.ball.position[:, 2] = 0.05

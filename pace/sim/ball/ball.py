@@ -5,28 +5,21 @@ Frame: origin on the floor below the table's centre, x towards the opponent, z u
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import lru_cache
-from typing import Any
 
 import torch
 import warp as wp
 from omegaconf import OmegaConf
 from torch import Tensor
 
-from pace.arrays.share import record, share, share_all
+from pace.arrays.launch import Bound, Launch, MaskedLaunch
+from pace.arrays.tensors import allocate
 from pace.config.base import ConfigError, config_dir, parse
 from pace.config.sim import BallConfig, TableConfig
+from pace.sim.ball.events import BallEvents, Forecast
 from pace.sim.ball.flight import Scene
-from pace.sim.ball.kernels import (
-    FORECAST_HORIZON,
-    EventArrays,
-    ForecastArrays,
-    fly_step,
-    forecast_flight,
-    skip_flight,
-)
+from pace.sim.ball.kernels import FORECAST_HORIZON, fly_step, forecast_flight, skip_flight
 from pace.sim.ball.rebound import Material
 
 __all__ = ["FORECAST_HORIZON", "BallEvents", "BallParams", "BallSim", "Forecast", "ball_preset"]
@@ -111,93 +104,6 @@ class BallParams:
 PARAM_NAMES = tuple(f.name for f in fields(BallParams))
 
 
-@dataclass(frozen=True)
-class BallEvents:
-    """What the ball met in the last control step; every flight overwrites all of it.
-
-    Counts are of contacts that begin; rolling or resting on counts once. The rims of the table's top belong to the top
-    (ITTF 2.1.5); its sides and underside count as ``edge``. Times are s into the control step, of the first contact of
-    that kind, infinite if there is none. The ``hit`` values belong to the first paddle hit and are zero without one.
-    """
-
-    own_bounce: Tensor  # (N,) int32
-    opponent_bounce: Tensor  # (N,) int32
-    paddle_hit: Tensor  # (N,) int32
-    net: Tensor  # (N,) int32
-    floor: Tensor  # (N,) int32
-    edge: Tensor  # (N,) int32
-    own_bounce_time: Tensor  # (N,) s
-    opponent_bounce_time: Tensor  # (N,) s
-    paddle_hit_time: Tensor  # (N,) s
-    net_time: Tensor  # (N,) s
-    floor_time: Tensor  # (N,) s
-    edge_time: Tensor  # (N,) s
-    hit_point: Tensor  # (N, 3) m, where ball and paddle touched
-    hit_position: Tensor  # (N, 3) m, ball's centre
-    hit_offset: Tensor  # (N, 3) m, ball's centre minus paddle's centre
-    hit_normal: Tensor  # (N, 3) unit vector from the paddle to the ball
-    hit_relative_velocity: Tensor  # (N, 3) m/s, ball's centre minus the paddle's point, before the impact
-    hit_velocity_in: Tensor  # (N, 3) m/s
-    hit_velocity_out: Tensor  # (N, 3) m/s
-    hit_spin_out: Tensor  # (N, 3) rad/s
-    hit_rim: Tensor  # (N,) bool, the rim or its edge rather than a face
-    paddle_impulse: Tensor  # (N, 3) N s on the paddle, sum over the step
-    impulse_point: Tensor  # (N, 3) m, where the last of it acted
-    bounce_position: Tensor  # (N, 3) m, ball's centre at the step's first bounce on the table's top
-
-    @classmethod
-    def allocate(cls, num_worlds: int, device: torch.device | str) -> BallEvents:
-        """No event in any world."""
-        return cls(**{f.name: _event_tensor(f.name, num_worlds, device) for f in fields(cls)})
-
-
-def _event_tensor(name: str, num_worlds: int, device: torch.device | str) -> Tensor:
-    if name.endswith("_time"):
-        return torch.full((num_worlds,), float("inf"), device=device)
-    if name == "hit_rim":
-        return torch.zeros(num_worlds, device=device, dtype=torch.bool)
-    if name.startswith(("hit_", "paddle_impulse", "impulse_", "bounce_")):
-        return torch.zeros(num_worlds, 3, device=device)
-    return torch.zeros(num_worlds, device=device, dtype=torch.int32)
-
-
-@dataclass(frozen=True)
-class Forecast:
-    """A flight ahead without a paddle: tensors (N, ...), float32, s and m from now on, NaN where there is none.
-
-    ``bounce`` is the first on the own half, ``apex`` where the ball first stops rising after it, and ``intercept`` the
-    later of the apex and the passing of x = intercept_x. ``landing`` is the first contact with the table's top or the
-    floor. Positions are of the ball's centre. The forecast ends on the floor, or after :data:`FORECAST_HORIZON`.
-    """
-
-    bounce: Tensor  # (N, 3) m
-    bounce_time: Tensor  # (N,) s
-    bounce_velocity: Tensor  # (N, 3) m/s, after the bounce
-    apex: Tensor  # (N, 3) m
-    apex_time: Tensor  # (N,) s
-    intercept: Tensor  # (N, 3) m
-    intercept_time: Tensor  # (N,) s
-    intercept_velocity: Tensor  # (N, 3) m/s
-    landing: Tensor  # (N, 3) m
-    landing_time: Tensor  # (N,) s
-    landing_own: Tensor  # (N,) bool, the landing is on the own half of the table
-    landing_opponent: Tensor  # (N,) bool, the landing is on the opponent's half
-    net_height: Tensor  # (N,) m, z where the ball first passes x = 0 towards the opponent
-
-    @classmethod
-    def allocate(cls, num_worlds: int, device: torch.device | str) -> Forecast:
-        """A forecast of nothing: NaN, and no landing."""
-        vectors = ("bounce", "bounce_velocity", "apex", "intercept", "intercept_velocity", "landing")
-        tensors = {}
-        for f in fields(cls):
-            shape = (num_worlds, 3) if f.name in vectors else (num_worlds,)
-            flag = f.name in ("landing_own", "landing_opponent")
-            tensors[f.name] = torch.full(
-                shape, 0 if flag else float("nan"), device=device, dtype=torch.bool if flag else torch.float32
-            )
-        return cls(**tensors)
-
-
 def _material(restitution: float, friction: float) -> Material:
     material = Material()
     material.restitution = restitution
@@ -205,8 +111,8 @@ def _material(restitution: float, friction: float) -> Material:
     return material
 
 
-def _scene(table: TableConfig, path: Tensor, path_dt: float) -> Scene:
-    """Table, net, floor and the paddle's path as the kernels read them."""
+def _scene(table: TableConfig, path_dt: float) -> Scene:
+    """Table, net and floor as the kernels read them; the paddle's path is still to come."""
     scene = Scene()
     scene.table_centre = wp.vec3(0.0, 0.0, table.height - 0.5 * table.thickness)
     scene.table_half = wp.vec3(0.5 * table.length, 0.5 * table.width, 0.5 * table.thickness)
@@ -216,7 +122,6 @@ def _scene(table: TableConfig, path: Tensor, path_dt: float) -> Scene:
     scene.floor = _material(table.floor_restitution, table.floor_friction)
     scene.paddle_radius = table.paddle_radius
     scene.paddle_half_thickness = table.paddle_half_thickness
-    scene.path = wp.from_torch(path)
     scene.path_dt = path_dt
     return scene
 
@@ -262,25 +167,35 @@ class BallSim:
         self.velocity = torch.zeros(num_worlds, 3, device=device)
         self.spin = torch.zeros(num_worlds, 3, device=device)
         self.nearest_paddle_distance = torch.zeros(num_worlds, device=device)
-        self._param_matrix = params.matrix(num_worlds, device)
-        self.params = BallParams(*self._param_matrix.unbind(1))
-        self.events = BallEvents.allocate(num_worlds, device)
-        self.forecast_result = Forecast.allocate(num_worlds, device)
+        matrix = params.matrix(num_worlds, device)
+        self.params = BallParams(*matrix.unbind(1))
+        self.events = allocate(BallEvents, num_worlds, device)
+        self.forecast_result = allocate(Forecast, num_worlds, device)
         self._path_shape = (num_worlds, substeps + 1, PATH_WIDTH)
-        self._path = torch.zeros(self._path_shape, device=device)
-        self._ask_mask = torch.zeros(num_worlds, dtype=torch.bool, device=device)
-        self._ask = torch.zeros(3, num_worlds, 3, device=device)
-        self._scene = _scene(table, self._path, control_dt / substeps)
-        self._ball_dt = ball_dt
-        self._ahead: dict[float, Callable[[Tensor], None]] = {}  # by intercept_x, from _ask
-        self._fly = self._record_flight()
+        self._scene = _scene(table, control_dt / substeps)
+        self._ball = {"position": self.position, "velocity": self.velocity, "spin": self.spin}
+        self._flown = {"params": matrix, "scene": self._scene, "ball_dt": ball_dt}  # what every flight needs to know
+        self._ask = {name: torch.zeros_like(tensor) for name, tensor in self._ball.items()}
+        self._ahead: dict[float, MaskedLaunch] = {}  # by intercept_x, from _ask
+        self._fly = Bound(self._record_flight, paddle_path=None)
 
-    def _record_flight(self) -> Callable[[], None]:
-        """The flight along the present path, recorded so that a call only replays it."""
-        ball = [share(self.position), share(self.velocity), share(self.spin)]
-        events = [share_all(EventArrays, vars(self.events)), share(self.nearest_paddle_distance)]
-        inputs = [*ball, wp.from_torch(self._param_matrix), self._scene, *events, self.control_dt, self._ball_dt]
-        return record(fly_step, self.num_worlds, inputs, self.device)
+    def _record_flight(self, path: Tensor) -> Launch:
+        if path.shape != self._path_shape or path.dtype != torch.float32 or not path.is_contiguous():
+            raise ValueError(
+                f"paddle_path must be contiguous float32 of shape {self._path_shape}, "
+                f"not {path.dtype} of shape {tuple(path.shape)}"
+            )
+        self._scene.path = wp.from_torch(path)
+        return Launch(
+            fly_step,
+            self.num_worlds,
+            self.device,
+            events=self.events,
+            nearest=self.nearest_paddle_distance,
+            control_dt=self.control_dt,
+            **self._ball,
+            **self._flown,
+        )
 
     def fly(self, paddle_path: Tensor) -> None:
         """Fly one control step along ``paddle_path`` (N, S + 1, 12), world frame, S + 1 equidistant instants:
@@ -292,19 +207,7 @@ class BallSim:
 
         Errors: ``ValueError`` for another shape, type or memory layout.
         """
-        if paddle_path is not self._path:
-            self._bind_path(paddle_path)
-        self._fly()
-
-    def _bind_path(self, path: Tensor) -> None:
-        if path.shape != self._path_shape or path.dtype != torch.float32 or not path.is_contiguous():
-            raise ValueError(
-                f"paddle_path must be contiguous float32 of shape {self._path_shape}, "
-                f"not {path.dtype} of shape {tuple(path.shape)}"
-            )
-        self._path = path
-        self._scene.path = wp.from_torch(path)
-        self._fly = self._record_flight()
+        self._fly(paddle_path)()
 
     def forecast(self, mask: Tensor, position: Tensor, velocity: Tensor, spin: Tensor, intercept_x: float) -> None:
         """Look ahead from position, velocity and spin (N, 3) in the worlds of ``mask`` (N,) bool.
@@ -312,36 +215,29 @@ class BallSim:
         Fills their rows of ``forecast_result`` and leaves the others; ``intercept_x`` is in m. The flight passes
         through paddles; net, table and floor are met.
         """
-        for own, given in zip(self._ask, (position, velocity, spin), strict=True):
+        for own, given in zip(self._ask.values(), (position, velocity, spin), strict=True):
             own.copy_(given)
         if intercept_x not in self._ahead:
-            self._ahead[intercept_x] = self.forecaster(self._ask[0], self._ask[1], self._ask[2], intercept_x)
+            self._ahead[intercept_x] = self.forecaster(**self._ask, intercept_x=intercept_x)
         self._ahead[intercept_x](mask)
 
-    def forecaster(
-        self, position: Tensor, velocity: Tensor, spin: Tensor, intercept_x: float
-    ) -> Callable[[Tensor], None]:
+    def forecaster(self, position: Tensor, velocity: Tensor, spin: Tensor, intercept_x: float) -> MaskedLaunch:
         """:meth:`forecast` of a mask, always from these tensors: it reads them where they lie, which saves copies."""
-        start = [share(position), share(velocity), share(spin)]
-        result = share_all(ForecastArrays, vars(self.forecast_result))
-        inputs = [*start, wp.from_torch(self._param_matrix), self._scene, result, intercept_x, self._ball_dt]
-        return self._of_a_mask(forecast_flight, inputs)
+        return MaskedLaunch(
+            forecast_flight,
+            self.num_worlds,
+            self.device,
+            position=position,
+            velocity=velocity,
+            spin=spin,
+            forecast=self.forecast_result,
+            intercept_x=intercept_x,
+            **self._flown,
+        )
 
-    def _of_a_mask(self, kernel: wp.Kernel, inputs: list[Any]) -> Callable[[Tensor], None]:
-        """A function of a mask (N,) bool that launches ``kernel`` with that mask and ``inputs``."""
-        launch = record(kernel, self.num_worlds, [share(self._ask_mask), *inputs], self.device)
-
-        def call(mask: Tensor) -> None:
-            self._ask_mask.copy_(mask)
-            launch()
-
-        return call
-
-    def skipper(self, duration: Tensor) -> Callable[[Tensor], None]:
+    def skipper(self, duration: Tensor) -> MaskedLaunch:
         """A function of a mask (N,) bool that moves those balls on by ``duration`` (N,) s of their flight at once.
 
         No further than to where they are about to touch something; nothing is hit and nothing is noted.
         """
-        state = [share(duration), share(self.position), share(self.velocity), share(self.spin)]
-        inputs = [*state, wp.from_torch(self._param_matrix), self._scene, self._ball_dt]
-        return self._of_a_mask(skip_flight, inputs)
+        return MaskedLaunch(skip_flight, self.num_worlds, self.device, duration=duration, **self._ball, **self._flown)

@@ -5,6 +5,7 @@ One thread a world.
 
 import warp as wp
 
+from pace.sim.ball.events import EventArrays, ForecastArrays
 from pace.sim.ball.flight import (
     FLOOR,
     NET,
@@ -35,55 +36,6 @@ _MAX_LEGS = wp.constant(1024)
 _MAX_FORECAST_LEGS = wp.constant(8192)
 _HORIZON = wp.constant(FORECAST_HORIZON)
 _BISECTIONS = wp.constant(20)
-
-
-@wp.struct
-class EventArrays:
-    """The tensors of :class:`pace.sim.ball.ball.BallEvents`."""
-
-    own_bounce: wp.array[wp.int32]
-    opponent_bounce: wp.array[wp.int32]
-    paddle_hit: wp.array[wp.int32]
-    net: wp.array[wp.int32]
-    floor: wp.array[wp.int32]
-    edge: wp.array[wp.int32]
-    own_bounce_time: wp.array[wp.float32]
-    opponent_bounce_time: wp.array[wp.float32]
-    paddle_hit_time: wp.array[wp.float32]
-    net_time: wp.array[wp.float32]
-    floor_time: wp.array[wp.float32]
-    edge_time: wp.array[wp.float32]
-    hit_point: wp.array[wp.vec3]
-    hit_position: wp.array[wp.vec3]
-    hit_offset: wp.array[wp.vec3]
-    hit_normal: wp.array[wp.vec3]
-    hit_relative_velocity: wp.array[wp.vec3]
-    hit_velocity_in: wp.array[wp.vec3]
-    hit_velocity_out: wp.array[wp.vec3]
-    hit_spin_out: wp.array[wp.vec3]
-    hit_rim: wp.array[wp.bool]
-    paddle_impulse: wp.array[wp.vec3]
-    impulse_point: wp.array[wp.vec3]
-    bounce_position: wp.array[wp.vec3]
-
-
-@wp.struct
-class ForecastArrays:
-    """The tensors of :class:`pace.sim.ball.Forecast`."""
-
-    bounce: wp.array[wp.vec3]
-    bounce_time: wp.array[wp.float32]
-    bounce_velocity: wp.array[wp.vec3]
-    apex: wp.array[wp.vec3]
-    apex_time: wp.array[wp.float32]
-    intercept: wp.array[wp.vec3]
-    intercept_time: wp.array[wp.float32]
-    intercept_velocity: wp.array[wp.vec3]
-    landing: wp.array[wp.vec3]
-    landing_time: wp.array[wp.float32]
-    landing_own: wp.array[wp.bool]
-    landing_opponent: wp.array[wp.bool]
-    net_height: wp.array[wp.float32]
 
 
 @wp.func

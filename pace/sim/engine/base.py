@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Any, Protocol
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Protocol
 
 import mujoco
 import torch
 import warp as wp
 from torch import Tensor
 
-from pace.arrays.share import record, require_shape
+from pace.arrays.launch import Bound, MaskedLaunch
+from pace.arrays.state import Stateful, tensors_named
+from pace.arrays.tensors import Float, Start, Vec3, allocate
 from pace.config.base import ConfigError
 from pace.sim.robot import FEET
+
+Unit = Annotated[Float, Start(1.0)]
 
 
 @dataclass(frozen=True)
@@ -22,21 +27,20 @@ class EngineParams:
     Contact softness (``invweight0``) stays that of the nominal robot.
     """
 
-    friction: Tensor  # (N,) sliding friction of every contact
-    trunk_mass: Tensor  # (N,) kg added to the trunk, its inertia growing in proportion
-    trunk_com: Tensor  # (N, 3) m added to the trunk's centre of mass, trunk frame
-    kp_scale: Tensor  # (N,) of all joints
-    kd_scale: Tensor  # (N,)
-    armature_scale: Tensor  # (N,)
-    effort_scale: Tensor  # (N,) of the effort and, where the motors know their speed, of the stall torque
+    friction: Float  # sliding friction of every contact
+    trunk_mass: Float  # kg added to the trunk, its inertia growing in proportion
+    trunk_com: Vec3  # m added to the trunk's centre of mass, trunk frame
+    kp_scale: Unit  # of all joints
+    kd_scale: Unit
+    armature_scale: Unit
+    effort_scale: Unit  # of the effort and, where the motors know their speed, of the stall torque
 
     @classmethod
     def nominal(cls, model: mujoco.MjModel, num_worlds: int, device: torch.device) -> EngineParams:
         """The parameters with which every world is ``model`` itself."""
-        values = dict.fromkeys((f.name for f in fields(cls)), 1.0)
-        values |= {"friction": float(model.pair_friction[0, 0]), "trunk_mass": 0.0, "trunk_com": 0.0}
-        shapes = {name: (num_worlds, 3) if name == "trunk_com" else (num_worlds,) for name in values}
-        return cls(**{name: torch.full(shapes[name], value, device=device) for name, value in values.items()})
+        params = allocate(cls, num_worlds, device)
+        params.friction.fill_(float(model.pair_friction[0, 0]))
+        return params
 
 
 class RobotEngine(Protocol):
@@ -90,16 +94,24 @@ class RobotEngine(Protocol):
         """Whether a world ever had more contacts or constraints than there is room for. Waits for the device."""
         ...
 
-    def state_dict(self) -> dict[str, Tensor]:
-        """All that the next control step depends on, besides ``params``: live tensors."""
+    def state_tensors(self) -> dict[str, Tensor]:
+        """All that the next control step depends on, besides ``params``: the tensors themselves."""
         ...
 
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+    def state_dict(self) -> dict[str, Tensor]:
+        """Copies of them."""
+        ...
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Put back what :meth:`state_dict` returned."""
         ...
 
 
-class StateTensors:
+#: What every engine shows; attributes of :class:`StateTensors`.
+OUTPUTS = ("qpos_path", "qvel_path", "foot_force", "body_contact", "joint_torque")
+
+
+class StateTensors(Stateful):
     """The tensors that every engine shows, and their part in reset and resume."""
 
     def __init__(
@@ -117,30 +129,33 @@ class StateTensors:
         self.body_contact = torch.zeros(num_worlds, model.nsensordata - 3 * len(FEET), device=device)
         self.joint_torque = torch.zeros(num_worlds, model.nu, device=device)
         self.qpos_path.copy_(torch.as_tensor(model.key_qpos[0], dtype=torch.float32))
-        self._mask = torch.zeros(num_worlds, dtype=torch.bool, device=device)
-        self._start: tuple[Tensor | None, ...] = (None, None)
+        starts = {"qpos": (num_worlds, model.nq), "qvel": (num_worlds, model.nv)}
+        self._reset = Bound(self._record_reset, **starts)
 
-    def _solver_state(self) -> tuple[Tensor, Tensor, Tensor]:
-        """qpos (N, 28), qvel (N, 27) and warm start (N, 27) of the engine itself, in its precision."""
+    def _solver_state(self) -> dict[str, Tensor]:
+        """qpos (N, 28), qvel (N, 27) and warmstart (N, 27) of the engine itself, in its precision."""
         raise NotImplementedError
 
     def reset(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
         """See :class:`RobotEngine`. Give the same tensors each time: others are bound anew, which takes longer."""
-        if self._start[0] is not qpos or self._start[1] is not qvel:
-            self._bind_start(qpos, qvel)
-        self._mask.copy_(mask)
-        self._reset()
+        self._reset(qpos, qvel)(mask)
 
-    def _bind_start(self, qpos: Tensor, qvel: Tensor) -> None:
-        for name, state, path in (("qpos", qpos, self.qpos_path), ("qvel", qvel, self.qvel_path)):
-            require_shape(name, state, (self.num_worlds, path.shape[2]))
-        self._start = (qpos, qvel)
-        tensors = (self._mask, qpos, qvel, *self._solver_state(), *self._outputs().values())
-        self._reset = record(reset_state, self.num_worlds, [wp.from_torch(t) for t in tensors], self.device)
+    def _record_reset(self, qpos: Tensor, qvel: Tensor) -> MaskedLaunch:
+        solver = self._solver_state()
+        return MaskedLaunch(
+            reset_state,
+            self.num_worlds,
+            self.device,
+            qpos=qpos,
+            qvel=qvel,
+            own_qpos=solver["qpos"],
+            own_qvel=solver["qvel"],
+            warmstart=solver["warmstart"],
+            **tensors_named(self, OUTPUTS),
+        )
 
-    def _outputs(self) -> dict[str, Tensor]:
-        names = ("qpos_path", "qvel_path", "foot_force", "body_contact", "joint_torque")
-        return {name: getattr(self, name) for name in names}
+    def state_tensors(self) -> dict[str, Tensor]:
+        return self._solver_state() | tensors_named(self, OUTPUTS)
 
     def _read_sensors(self, sensordata: Tensor, actuator_force: Tensor) -> None:
         """Sensors of the scene: a force of 3 for each foot, then a number of contacts for each other body."""

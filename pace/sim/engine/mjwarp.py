@@ -9,6 +9,7 @@ import warp as wp
 from torch import Tensor
 
 from pace.arrays.graph import CapturedCall, RecordedLaunches, graphs_wanted
+from pace.arrays.launch import Launch
 from pace.arrays.share import warp_scope
 from pace.config.sim import EngineConfig
 from pace.sim.engine.base import StateTensors
@@ -75,8 +76,8 @@ class MjwarpEngine(StateTensors):
         self._sensordata, self._actuator_force = wp.to_torch(data.sensordata), wp.to_torch(data.actuator_force)
         self._overflow = wp.to_torch(data.overflow)
         self._targets = torch.zeros(num_worlds, substeps, model.nu, device=device)
-        self._warp_targets = wp.from_torch(self._targets)
-        self._warp_path = [wp.from_torch(self.qpos_path), wp.from_torch(self.qvel_path)]
+        self._load = [self._load_targets(step) for step in range(substeps)]
+        self._note = [self._record_state(instant) for instant in range(substeps + 1)]
         if device.type == "cuda":
             self._step = CapturedCall(self._play, device, graphs_wanted(engine, device))
         else:
@@ -92,18 +93,24 @@ class MjwarpEngine(StateTensors):
     def _play(self) -> None:
         """The launches of one control step."""
         with warp_scope(self.device):
-            self._record(0)
-            for step in range(self.substeps):
-                wp.launch(_load_targets, dim=self.data.ctrl.shape, inputs=[self._warp_targets, step, self.data.ctrl])
+            self._note[0]()
+            for load, note in zip(self._load, self._note[1:], strict=True):
+                load()
                 mjw.step(self.model, self.data)
-                self._record(step + 1)
+                note()
 
-    def _record(self, instant: int) -> None:
-        inputs = [self.data.qpos, self.data.qvel, instant, *self._warp_path]
-        wp.launch(_record_state, dim=self.num_worlds, inputs=inputs)
+    def _load_targets(self, step: int) -> Launch:
+        ctrl = self.data.ctrl
+        return Launch(_load_targets, ctrl.shape, self.device, targets=self._targets, step=step, ctrl=ctrl)
 
-    def _solver_state(self) -> tuple[Tensor, Tensor, Tensor]:
-        return self._qpos, self._qvel, self._warmstart
+    def _record_state(self, instant: int) -> Launch:
+        data, paths = self.data, {"qpos_path": self.qpos_path, "qvel_path": self.qvel_path}
+        return Launch(
+            _record_state, self.num_worlds, self.device, qpos=data.qpos, qvel=data.qvel, instant=instant, **paths
+        )
+
+    def _solver_state(self) -> dict[str, Tensor]:
+        return {"qpos": self._qpos, "qvel": self._qvel, "warmstart": self._warmstart}
 
     def apply_params(self, mask: Tensor) -> None:
         self._fields.write(mask)
@@ -113,11 +120,3 @@ class MjwarpEngine(StateTensors):
 
     def overflowed(self) -> bool:
         return bool((self._overflow & int(_DROPPED)).any())
-
-    def state_dict(self) -> dict[str, Tensor]:
-        state = {"qpos": self._qpos, "qvel": self._qvel, "warmstart": self._warmstart}
-        return state | self._outputs()
-
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        for name, tensor in self.state_dict().items():
-            tensor.copy_(state[name])

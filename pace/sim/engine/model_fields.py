@@ -5,12 +5,12 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
-import torch
 import warp as wp
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from pace.arrays.share import record, share
+from pace.arrays.launch import MaskedLaunch
+from pace.arrays.share import share
 from pace.sim.engine.base import EngineParams
 from pace.sim.robot import TRUNK_BODY
 
@@ -80,17 +80,12 @@ class ModelFields:
 
     def __init__(self, model: mujoco.MjModel, params: EngineParams, fields: Mapping[str, Tensor]) -> None:
         count, device = params.friction.shape[0], params.friction.device
-        self._params, self._fields = params, fields  # the kernel knows the tensors by address alone
-        self._mask = torch.zeros(count, dtype=torch.bool, device=device)
+        self._params, self._fields = params, fields  # the kernel's table knows the tensors by address alone
         changes = [*_body(model, params), *_motors(model, params)]
         writes = [write for change in changes for write in _writes(change, fields[change.field])]
         table = wp.array(writes, dtype=Write, device=wp.device_from_torch(device))
-        self._write = record(_write_fields, count, [share(self._mask), table], device)
-
-    def write(self, mask: Tensor) -> None:
-        """Give the parameters of the worlds of ``mask`` (N,) bool to their models."""
-        self._mask.copy_(mask)
-        self._write()
+        #: Gives the parameters of the worlds of a mask (N,) bool to their models.
+        self.write = MaskedLaunch(_write_fields, count, device, writes=table)
 
 
 def _body(model: mujoco.MjModel, params: EngineParams) -> Iterator[Change]:

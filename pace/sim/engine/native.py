@@ -64,9 +64,9 @@ class NativeEngine(StateTensors):
             path[:, 1:] = self._record[name]
         self._read_sensors(self._sensordata, self._actuator_force)
 
-    def _solver_state(self) -> tuple[Tensor, Tensor, Tensor]:
-        qpos, qvel, warmstart = (torch.from_numpy(array) for array in (self._qpos, self._qvel, self._warmstart))
-        return qpos, qvel, warmstart
+    def _solver_state(self) -> dict[str, Tensor]:
+        state = {"qpos": self._qpos, "qvel": self._qvel, "warmstart": self._warmstart}
+        return {name: torch.from_numpy(array) for name, array in state.items()}
 
     def apply_params(self, mask: Tensor) -> None:
         self._fields.write(mask)
@@ -77,14 +77,6 @@ class NativeEngine(StateTensors):
     def overflowed(self) -> bool:
         full = [int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_CNSTRFULL)]
         return bool(self._batch.warning[:, full, 1].any())  # mjWarningStat: last info, number
-
-    def state_dict(self) -> dict[str, Tensor]:
-        state = {"qpos": self._qpos, "qvel": self._qvel, "warmstart": self._warmstart}
-        return {name: torch.from_numpy(array) for name, array in state.items()} | self._outputs()
-
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        for name, tensor in self.state_dict().items():
-            tensor.copy_(state[name])
 
 
 def stop_timers() -> None:

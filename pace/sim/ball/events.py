@@ -1,0 +1,76 @@
+"""What a ball met in a control step, and what it will meet: tensors of N worlds, and the kernels' structs of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pace.arrays.tensors import Bool, InfFloat, Int, NanFloat, NanVec3, Vec3, struct_of
+
+
+@dataclass(frozen=True)
+class BallEvents:
+    """What the ball met in the last control step; every flight overwrites all of it.
+
+    Counts are of contacts that begin; rolling or resting on counts once. The rims of the table's top belong to the top
+    (ITTF 2.1.5); its sides and underside count as ``edge``. Times are s into the control step, of the first contact of
+    that kind, infinite if there is none. The ``hit`` values belong to the first paddle hit and are zero without one.
+    """
+
+    own_bounce: Int
+    opponent_bounce: Int
+    paddle_hit: Int
+    net: Int
+    floor: Int
+    edge: Int
+    own_bounce_time: InfFloat  # s
+    opponent_bounce_time: InfFloat  # s
+    paddle_hit_time: InfFloat  # s
+    net_time: InfFloat  # s
+    floor_time: InfFloat  # s
+    edge_time: InfFloat  # s
+    hit_point: Vec3  # m, where ball and paddle touched
+    hit_position: Vec3  # m, ball's centre
+    hit_offset: Vec3  # m, ball's centre minus paddle's centre
+    hit_normal: Vec3  # unit vector from the paddle to the ball
+    hit_relative_velocity: Vec3  # m/s, ball's centre minus the paddle's point, before the impact
+    hit_velocity_in: Vec3  # m/s
+    hit_velocity_out: Vec3  # m/s
+    hit_spin_out: Vec3  # rad/s
+    hit_rim: Bool  # the rim or its edge rather than a face
+    paddle_impulse: Vec3  # N s on the paddle, sum over the step
+    impulse_point: Vec3  # m, where the last of it acted
+    bounce_position: Vec3  # m, ball's centre at the step's first bounce on the table's top
+
+
+@struct_of(BallEvents)
+class EventArrays:
+    """:class:`BallEvents` as kernels see it."""
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """A flight ahead without a paddle: tensors (N, ...), float32, s and m from now on, NaN where there is none.
+
+    ``bounce`` is the first on the own half, ``apex`` where the ball first stops rising after it, and ``intercept`` the
+    later of the apex and the passing of x = intercept_x. ``landing`` is the first contact with the table's top or the
+    floor. Positions are of the ball's centre. The forecast ends on the floor, or after :data:`FORECAST_HORIZON`.
+    """
+
+    bounce: NanVec3  # m
+    bounce_time: NanFloat  # s
+    bounce_velocity: NanVec3  # m/s, after the bounce
+    apex: NanVec3  # m
+    apex_time: NanFloat  # s
+    intercept: NanVec3  # m
+    intercept_time: NanFloat  # s
+    intercept_velocity: NanVec3  # m/s
+    landing: NanVec3  # m
+    landing_time: NanFloat  # s
+    landing_own: Bool  # the landing is on the own half of the table
+    landing_opponent: Bool  # the landing is on the opponent's half
+    net_height: NanFloat  # m, z where the ball first passes x = 0 towards the opponent
+
+
+@struct_of(Forecast)
+class ForecastArrays:
+    """:class:`Forecast` as kernels see it."""

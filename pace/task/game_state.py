@@ -1,0 +1,103 @@
+"""What the rules know of N worlds: the parts of a :class:`pace.task.game.Game`, and the kernels' struct of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from pace.arrays.tensors import Bool, Float, InfFloat, Int, NanFloat, NanVec3, Start, Vec3, struct_of
+from pace.task.outcome import Outcome
+
+
+@dataclass(eq=False)
+class ServeClock:
+    """Counts serves and their time."""
+
+    time: Float  # s since the serve began
+    index: Float  # number of the serve in its episode
+    played: Float  # serves finished since the world was made
+    fresh: Annotated[Bool, Start(True)]  # the world has not been reset yet
+
+
+@dataclass(eq=False)
+class Referee:
+    """What the referee knows of each serve.
+
+    A hit is physical contact after exactly one bounce on the own half; a valid return then lands first on the
+    opponent's half (it may touch the net on the way). What is decided stays decided until the next serve.
+    Events of one kind after its first within a control step have no time of their own; they are taken to follow the
+    contact at once, which is exact unless a ball meets the table twice and the paddle within 20 ms.
+    """
+
+    own_bounces: Int
+    outcome: Annotated[Int, Start(Outcome.BAD_SERVE)]  # :class:`Outcome`
+    touch_time: InfFloat  # s on the serve clock, of the first paddle contact
+    hit: Bool  # legal
+    touched: Bool  # any paddle contact
+    rim: Bool  # the hit was with the rim
+    net_touched: Bool  # after the hit
+    was_open: Bool  # before the last step
+    hit_now: Bool  # in the last step
+    success_now: Bool  # in the last step
+
+
+@dataclass(eq=False)
+class Target:
+    """Where and when the paddle should meet the ball: from the forecast of the serve. World frame, serve clock."""
+
+    playable: Bool
+    something_to_hit: Bool  # the ball can still be hit legally
+    apex: Vec3  # m
+    point: Vec3  # m, the paddle's target
+    arriving: Vec3  # m/s, the ball's velocity at the later of the apex and ``reward.target_x``
+    apex_time: Float  # s
+    time: Float  # s, when the ball is at ``point``
+
+
+@dataclass(eq=False)
+class ReturnForecast:
+    """Forecast of the flight after a hit, kept until the next one; NaN if there is none."""
+
+    landing: NanVec3  # m, first contact with table or floor
+    net_height: NanFloat  # m above the floor when it crosses the net towards +x
+    lands_own: Bool
+    lands_opponent: Bool
+
+
+@dataclass(eq=False)
+class Closeness:
+    """How near the paddle came to the ball while it could be hit legally, over each serve."""
+
+    nearest: InfFloat  # m, smallest distance from the face centre to the ball's surface so far
+    previous: InfFloat  # m, the same a control step ago
+    arrived: Bool  # the ball was hit or is past its target time
+    arrived_now: Bool  # since this step
+
+
+@dataclass(eq=False)
+class StepEnds:
+    """What ended in the last control step."""
+
+    lost: Bool  # the robot fell or left its area
+    over: Bool  # the serve ended
+    next_serve: Bool  # and another one follows
+    truncated: Bool  # it was the episode's last
+    hit: Bool  # of the current serve, also after the next one has begun
+    outcome: Int  # the same
+
+
+@dataclass(eq=False)
+class GameState:
+    """All of them."""
+
+    clock: ServeClock
+    referee: Referee
+    target: Target
+    returns: ReturnForecast
+    closeness: Closeness
+    ends: StepEnds
+
+
+@struct_of(GameState)
+class GameArrays:
+    """:class:`GameState` as kernels see it."""
