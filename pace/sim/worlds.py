@@ -18,7 +18,8 @@ from pace.sim.ball.ball import BallParams, BallSim
 from pace.sim.engine.factory import make_engine
 from pace.sim.kinematics import Kinematics
 from pace.sim.randomization import Randomizer
-from pace.sim.robot import JOINT_NAMES, build_model, nominal_pose
+from pace.sim.robot import build_model, nominal_pose
+from pace.sim.robot_spec import RobotSpec
 
 
 @dataclass(frozen=True)
@@ -29,10 +30,10 @@ class RobotState:
     joint torques belong to the last physics step.
     """
 
-    joint_position: Tensor  # (N, 21) rad
-    joint_velocity: Tensor  # (N, 21) rad/s
-    joint_acceleration: Tensor  # (N, 21) rad/s^2, mean over the control step
-    joint_torque: Tensor  # (N, 21) N m
+    joint_position: Tensor  # (N, J) rad
+    joint_velocity: Tensor  # (N, J) rad/s
+    joint_acceleration: Tensor  # (N, J) rad/s^2, mean over the control step
+    joint_torque: Tensor  # (N, J) N m
     base_position: Tensor  # (N, 3) m
     base_quat: Tensor  # (N, 4) w, x, y, z
     base_linear_velocity: Tensor  # (N, 3) m/s
@@ -139,8 +140,6 @@ class Worlds:
         model: robot and scene; ``None`` builds them from ``config``.
     """
 
-    joint_names = JOINT_NAMES
-
     def __init__(
         self,
         config: SimConfig,
@@ -153,10 +152,11 @@ class Worlds:
         self.num_worlds = num_worlds
         self.device = resolve_device(device)
         self.control_dt = config.robot.control_dt
+        self.spec = RobotSpec.of(config.robot)
         self.generator = generator or torch.Generator(self.device).manual_seed(0)
         self.model = model or build_model(config.robot, config.engine, config.ball.table)
         self.engine = make_engine(self.model, config.engine, num_worlds, self.device, config.substeps)
-        self.kinematics = Kinematics(self.model, num_worlds, config.substeps, self.device)
+        self.kinematics = Kinematics(self.model, self.spec.tips, num_worlds, config.substeps, self.device)
         self.ball = BallSim(
             num_worlds,
             self.device,
@@ -180,7 +180,7 @@ class Worlds:
         self._allocate()
 
     def _allocate(self) -> None:
-        n, device, joints = self.num_worlds, self.device, len(JOINT_NAMES)
+        n, device, joints = self.num_worlds, self.device, len(self.spec.joints)
         self.nominal = torch.as_tensor(nominal_pose(self.config.robot), dtype=torch.float32, device=device)
         limits = torch.as_tensor(self.model.jnt_range[1:], dtype=torch.float32, device=device)
         self.joint_lower, self.joint_upper = limits[:, 0].contiguous(), limits[:, 1].contiguous()
@@ -236,7 +236,7 @@ class Worlds:
         )
 
     def step(self, targets: Tensor) -> None:
-        """One control step towards joint targets (N, 21) rad; ``robot``, ``ball`` and ``ball.events`` are new after it.
+        """One control step towards joint targets (N, J) rad; ``robot``, ``ball`` and ``ball.events`` are new after it.
 
         Order: targets pass the actuator delay (a physics step in which the new target arrives gets the mean of both),
         pushes and the ball's last impulse on the paddle act, the robot moves, then the ball flies the same interval
@@ -277,7 +277,7 @@ class Worlds:
             self._derive_masked()
 
     def reset_robot(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
-        """Put the robots of ``mask`` (N,) bool into state qpos (N, 28), qvel (N, 27) and draw their parameters anew."""
+        """Put the robots of ``mask`` (N,) bool into state qpos (N, 7 + J), qvel (N, 6 + J) and sample their parameters."""
         self.randomizer.draw(mask)
         self._update_delay()
         self.engine.apply_params(mask)

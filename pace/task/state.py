@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import torch
@@ -10,7 +9,6 @@ import warp as wp
 from torch import Tensor
 
 from pace.arrays.share import record, share, share_all
-from pace.sim.robot import RIGHT_ARM
 from pace.task.game import Game
 from pace.task.state_kernels import DerivedArrays, JointArrays, Measures, RobotArrays, derive, measure
 
@@ -19,18 +17,8 @@ if TYPE_CHECKING:
     from pace.sim.worlds import RobotState, Worlds
 
 
-def _is_hip_waist_left_arm(name: str) -> bool:
-    left_arm = name.startswith("Left_") and ("Shoulder_Pitch" in name or "Elbow" in name)
-    return left_arm or "Hip_Yaw" in name or "Hip_Roll" in name or name == "Waist"
-
-
-#: Groups of joints that reward terms sum over.
-JOINT_GROUPS: dict[str, Callable[[str], bool]] = {
-    "ankles": lambda name: "Ankle" in name,
-    "hip_waist_left_arm": _is_hip_waist_left_arm,
-    "left_shoulder_roll": lambda name: name == "Left_Shoulder_Roll",
-    "right_arm": RIGHT_ARM.__contains__,
-}
+#: Groups of joints that reward terms sum over: keys of ``robot.groups``; a robot may lack some.
+JOINT_GROUPS = tuple(name for name in JointArrays.vars if name != "nominal")  # type: ignore[attr-defined]
 
 
 class TaskState:
@@ -89,9 +77,10 @@ class TaskState:
         derived = share_all(DerivedArrays, vars(self))
         inputs = [self.game.arrays(), derived, *(share(tensor) for tensor in seen), self.game.rules]
         self._derive = record(derive, worlds.num_worlds, inputs, worlds.device)
+        joints, groups = worlds.spec.joints, worlds.spec.groups
         self._joints = {"nominal": self.nominal} | {
-            group: torch.tensor([float(belongs(name)) for name in worlds.joint_names], device=worlds.device)
-            for group, belongs in JOINT_GROUPS.items()
+            group: torch.tensor([float(name in groups.get(group, ())) for name in joints], device=worlds.device)
+            for group in JOINT_GROUPS
         }
         actions = {"action": self.action, "previous_action": self.previous_action}
         measured = share_all(RobotArrays, vars(robot) | actions)
