@@ -277,7 +277,7 @@ class Worlds:
             self._derive_masked()
 
     def reset_robot(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
-        """Put the robots of ``mask`` (N,) bool into state qpos (N, 7 + J), qvel (N, 6 + J) and sample their parameters."""
+        """Put the robots of ``mask`` (N,) bool into qpos (N, 7 + J), qvel (N, 6 + J); sample their parameters."""
         self.randomizer.draw(mask)
         self._update_delay()
         self.engine.apply_params(mask)

@@ -19,7 +19,8 @@ SEED = 7
 @dataclass(frozen=True)
 class Swings:
     """T control steps of N worlds. ``qpos`` (T, N, 7 + J), ``qvel`` (T, N, 6 + J): the state before each step;
-    ``targets`` (T, N, J) rad: what the joints are told in it; ``ends`` (T, N) bool: the world is reset behind it; ``source``."""
+    ``targets`` (T, N, J) rad: what the joints are told in it; ``ends`` (T, N) bool: the world is reset after
+    it; ``source``."""
 
     qpos: Tensor
     qvel: Tensor

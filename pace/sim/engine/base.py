@@ -44,8 +44,8 @@ class RobotEngine(Protocol):
 
     Attributes:
         qpos_path, qvel_path: (N, S + 1, 7 + J) and (N, S + 1, 6 + J): the states at the S + 1 physics instants of the
-            last control step, 0 its start and S its end. MuJoCo's conventions: quaternion w, x, y, z; linear velocity of
-            the base in the world frame, its angular velocity in the body frame.
+            last control step, 0 its start and S its end. MuJoCo's conventions: quaternion w, x, y, z; linear velocity
+            of the base in the world frame, its angular velocity in the body frame.
         foot_force: (N, 2, 3) N, world frame: net contact force on the left and right foot in the last physics step.
         body_contact: (N, B): 1 where that body of ``RobotSpec.contacts`` touched anything in the last physics step.
         joint_torque: (N, J) N m: what the motors gave in the last physics step.
