@@ -21,9 +21,15 @@ class JointGroup:
 
 @dataclass
 class RobotConfig:
-    """The robot: control rate, gains, nominal pose."""
+    """The robot: its MJCF and the parts of it by name, control rate, gains, nominal pose."""
 
     name: str
+    model: str  # MJCF: a file of pace/sim/assets, or a path
+    paddle_site: str  # site at the centre of the blade; its link's x axis is the normal of the face
+    foot_sites: list[str]  # sites at the centres of the left and the right sole
+    head_site: str
+    arm: list[str]  # parts of the names of the joints between trunk and paddle, past the waist
+    groups: dict[str, list[str]]  # parts of the names of the joints that reward terms sum over, by group
     control_dt: float  # s
     action_scale: float  # rad per unit of action
     action_clip: float  # largest |action|
@@ -35,6 +41,7 @@ class RobotConfig:
 
     def __post_init__(self) -> None:
         require(self.control_dt > 0, "robot.control_dt must be positive")
+        require(len(self.foot_sites) == 2, f"robot.foot_sites must name a left and a right sole, got {self.foot_sites}")
         known = self.stall_ratio == 0 or 1 <= self.stall_ratio < math.inf
         require(known, f"robot.stall_ratio must be 0 (no limit) or a number from 1 on, got {self.stall_ratio}")
         slow = [group.match for group in self.joint_groups if group.max_speed <= 0]

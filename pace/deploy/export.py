@@ -37,7 +37,8 @@ from pace.deploy.graph import INPUTS, DeployedPolicy, input_ports, input_shapes,
 from pace.rl.policies import TaskPolicy, load_policy
 from pace.runs.checkpoint import CheckpointError
 from pace.runs.run_folder import VERSIONS, git_state, versions
-from pace.sim.robot import JOINT_NAMES, build_model, joint_gains, motor_lines, nominal_pose
+from pace.sim.robot import build_model, joint_gains, motor_lines, nominal_pose
+from pace.sim.robot_spec import RobotSpec
 from pace.task.env import TableTennisEnv
 from pace.task.observations import POLICY, layout
 
@@ -173,7 +174,7 @@ def metadata(policy: TaskPolicy, differences: Mapping[str, float], options: Expo
     return {
         "format": FORMAT,
         "procedure": PROCEDURE,
-        "joint_names": list(JOINT_NAMES),
+        "joint_names": list(RobotSpec.of(config.robot).joints),
         "nominal_pose": nominal_pose(config.robot).tolist(),
         "joint_range": model.jnt_range[1:].tolist(),
         "kp": kp,

@@ -21,7 +21,7 @@ from pace.onboard.steps import AttitudeEstimateStep, DelayEstimateStep, JointEst
 from pace.predictor.network import PredictorNetwork
 from pace.rl.agent import Policy
 from pace.rl.policies import TaskPolicy
-from pace.sim.robot import TRUNK_BODY, nominal_pose
+from pace.sim.robot import nominal_pose
 from pace.task.game import idle_point
 from pace.task.game_kernels import LONGEST_TIME
 from pace.task.observations import JOINTS, check_policy
@@ -135,13 +135,13 @@ class PaddleChain(nn.Module):
         super().__init__()
         body = int(model.site(PADDLE_SITE).bodyid[0])
         path: list[int] = []
-        while body != int(model.body(TRUNK_BODY).id):
+        while body != int(model.jnt_bodyid[0]):
             path.insert(0, body)
             body = int(model.body_parentid[body])
         joints = [int(model.body_jntadr[body]) for body in path]
         if min(joints) < 1 or model.jnt_pos[joints].any():
             raise ValueError("every body between trunk and paddle must have one joint, at its origin")
-        self.joints = [joint - 1 for joint in joints]  # index in JOINT_NAMES: joint 0 is the free one
+        self.joints = [joint - 1 for joint in joints]  # index in RobotSpec.joints: joint 0 is the free one
         rotations = [_matrix(model.body_quat[body]) for body in path]
         self.register_buffer("offsets", torch.tensor(model.body_pos[path], dtype=torch.float32))
         self.register_buffer("rotations", torch.stack(rotations))

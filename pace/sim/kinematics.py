@@ -6,6 +6,8 @@ states themselves, so that paddle path and state belong to the same instants wit
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import mujoco
 import numpy as np
 import torch
@@ -14,10 +16,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pace.arrays.launch import Bound, Launch, MaskedLaunch
-from pace.sim.robot import FEET
 
-#: The tips, in the order of the chains: sites of the model.
-TIPS = ("paddle", *FEET, "head")
+#: The tips, in the order of the chains (``RobotSpec.tips``).
 PADDLE, LEFT_FOOT, HEAD = wp.constant(0), wp.constant(1), wp.constant(3)
 
 
@@ -26,7 +26,7 @@ class Chains:
     """Kinematic chains from the base to each tip: the joints of chain c are links start[c] to start[c + 1] - 1."""
 
     start: wp.array[wp.int32]
-    joint: wp.array[wp.int32]  # index into JOINT_NAMES
+    joint: wp.array[wp.int32]  # index into RobotSpec.joints
     offset: wp.array[wp.vec3]  # m, joint's origin in the frame before it
     orientation: wp.array[wp.quat]  # of the joint's frame in the frame before it, at angle 0
     axis: wp.array[wp.vec3]
@@ -206,10 +206,10 @@ def _chain(model: mujoco.MjModel, site: str) -> tuple[list[tuple[int, NDArray, N
     return joints, tip
 
 
-def _build_chains(model: mujoco.MjModel, device: wp.Device) -> Chains:
+def _build_chains(model: mujoco.MjModel, tips: Sequence[str], device: wp.Device) -> Chains:
     if np.any(model.jnt_pos[1:]):
         raise ValueError("kinematics wants every joint at the origin of its body (joint pos 0 0 0)")
-    parts = [_chain(model, tip) for tip in TIPS]
+    parts = [_chain(model, tip) for tip in tips]
     links = [link for joints, _ in parts for link in joints]
     chains = Chains()
     chains.start = wp.array(np.cumsum([0, *(len(joints) for joints, _ in parts)]), dtype=wp.int32, device=device)
@@ -233,9 +233,11 @@ class Kinematics:
         head_position: (N, 3) m, at the end of the control step.
     """
 
-    def __init__(self, model: mujoco.MjModel, num_worlds: int, substeps: int, device: torch.device | str) -> None:
-        self._device = torch.device(device)
-        self._chains = _build_chains(model, wp.device_from_torch(self._device))
+    def __init__(
+        self, model: mujoco.MjModel, tips: Sequence[str], num_worlds: int, substeps: int, device: torch.device | str
+    ) -> None:
+        self._device, self._num_tips = torch.device(device), len(tips)
+        self._chains = _build_chains(model, tips, wp.device_from_torch(self._device))
         self._num_worlds = num_worlds
         self.paddle_path = torch.zeros(num_worlds, substeps + 1, 12, device=device)
         self.foot_position = torch.zeros(num_worlds, 2, 3, device=device)
@@ -253,7 +255,7 @@ class Kinematics:
         self._push = Bound(self._record_push, **paths, force=(n, 3), point=(n, 3), out=(n, model.nv))
 
     def update(self, qpos_path: Tensor, qvel_path: Tensor, mask: Tensor | None = None) -> None:
-        """Fill the attributes from qpos (N, S + 1, 28) and qvel (N, S + 1, 27).
+        """Fill the attributes from qpos (N, S + 1, 7 + J) and qvel (N, S + 1, 6 + J).
 
         ``mask`` (N,) bool: the worlds in which they are new; ``None``: all. The path is remembered:
         :meth:`paddle_generalized_force` uses its end.
@@ -265,7 +267,7 @@ class Kinematics:
         worlds, instants, _ = self.paddle_path.shape
         return MaskedLaunch(
             _update,
-            (worlds, instants + len(TIPS) - 1),
+            (worlds, instants + self._num_tips - 1),
             self._device,
             chains=self._chains,
             qpos_path=qpos_path,
@@ -282,7 +284,7 @@ class Kinematics:
     ) -> tuple[Tensor, Tensor]:
         """Paddle centre (N, 3) m and unit normal (N, 3), world frame, of any pose, for instance a sensed one.
 
-        Args: base_position (N, 3) m, base_quat (N, 4) wxyz, joint_position (N, 21) rad; mask (N,) bool: the worlds in
+        Args: base_position (N, 3) m, base_quat (N, 4) wxyz, joint_position (N, J) rad; mask (N,) bool: the worlds in
         which they are new, ``None``: all. The two tensors returned are overwritten by the next call. Give the same
         tensors each time: others are bound anew, which takes longer.
         """
@@ -303,7 +305,7 @@ class Kinematics:
         )
 
     def paddle_generalized_force(self, force: Tensor, point: Tensor, out: Tensor) -> None:
-        """Write J^T f of a force on the paddle's link into ``out`` (N, 27), for the end of the path last given.
+        """Write J^T f of a force on the paddle's link into ``out`` (N, 6 + J), for the end of the path last given.
 
         Args: force (N, 3) N and its point of attack (N, 3) m, world frame. Give the same tensors each time: others are
         bound anew, which takes longer.

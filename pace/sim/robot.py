@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
@@ -10,51 +10,8 @@ from numpy.typing import NDArray
 
 from pace.config.base import ConfigError
 from pace.config.sim import EngineConfig, JointGroup, RobotConfig, TableConfig
+from pace.sim.robot_spec import RobotSpec, model_path, read_scene
 
-SCENE = Path(__file__).parent / "assets" / "scene.xml"
-
-#: The 21 actuated joints, in the order of actions, of ``qpos[7:]`` and of ``qvel[6:]``.
-JOINT_NAMES = (
-    "Left_Shoulder_Pitch",
-    "Left_Shoulder_Roll",
-    "Left_Elbow_Pitch",
-    "Left_Elbow_Yaw",
-    "Right_Shoulder_Pitch",
-    "Right_Shoulder_Roll",
-    "Right_Elbow_Pitch",
-    "Right_Elbow_Yaw",
-    "Waist",
-    "Left_Hip_Pitch",
-    "Left_Hip_Roll",
-    "Left_Hip_Yaw",
-    "Left_Knee_Pitch",
-    "Left_Ankle_Pitch",
-    "Left_Ankle_Roll",
-    "Right_Hip_Pitch",
-    "Right_Hip_Roll",
-    "Right_Hip_Yaw",
-    "Right_Knee_Pitch",
-    "Right_Ankle_Pitch",
-    "Right_Ankle_Roll",
-)
-#: Those between the trunk and the paddle, past the waist.
-RIGHT_ARM = tuple(name for name in JOINT_NAMES if name.startswith(("Right_Shoulder", "Right_Elbow")))
-#: What can touch floor, table or paddle besides the feet; each is the name of its collision geom.
-CONTACT_BODIES = (
-    "trunk",
-    "head",
-    "left_upper_arm",
-    "right_upper_arm",
-    "left_forearm",
-    "right_forearm",
-    "paddle",
-    "left_thigh",
-    "right_thigh",
-    "left_shank",
-    "right_shank",
-)
-FEET = ("left_foot", "right_foot")
-TRUNK_BODY = "Trunk"
 #: Name of the keyframe: nominal pose, soles on the floor.
 NOMINAL_KEY = "nominal"
 #: Group of the geoms that only the eye needs.
@@ -64,27 +21,28 @@ POSITION = int(mujoco.mjtCtrlInput.mjINPUT_POS)
 
 
 def nominal_pose(robot: RobotConfig) -> NDArray[np.float64]:
-    """Nominal joint positions (21,), rad, in the order of ``JOINT_NAMES``.
+    """Nominal joint positions (J,), rad, in the order of ``RobotSpec.joints``.
 
     Errors: :class:`ConfigError` for a joint that the robot does not have.
     """
-    unknown = sorted(set(robot.nominal_pose) - set(JOINT_NAMES))
+    joints = RobotSpec.of(robot).joints
+    unknown = sorted(set(robot.nominal_pose) - set(joints))
     if unknown:
         raise ConfigError(f"robot.nominal_pose names no joint of the robot: {', '.join(unknown)}")
-    return np.array([robot.nominal_pose.get(name, 0.0) for name in JOINT_NAMES])
+    return np.array([robot.nominal_pose.get(name, 0.0) for name in joints])
 
 
 def joint_gains(robot: RobotConfig) -> NDArray[np.float64]:
-    """Rows kp (N m/rad), kd (N m s/rad) and effort (N m) of every joint: (3, 21).
+    """Rows kp (N m/rad), kd (N m s/rad) and effort (N m) of every joint: (3, J).
 
     Errors: :class:`ConfigError` for a joint that no group of ``robot.joint_groups`` matches.
     """
-    groups = [_group(robot, name) for name in JOINT_NAMES]
+    groups = [_group(robot, name) for name in RobotSpec.of(robot).joints]
     return np.array([(group.kp, group.kd, group.effort) for group in groups]).T
 
 
 def motor_lines(robot: RobotConfig) -> NDArray[np.float64] | None:
-    """Rows no-load speed (rad/s) and stall torque (N m) of every joint: (2, 21); None: motors that know no speed.
+    """Rows no-load speed (rad/s) and stall torque (N m) of every joint: (2, J); None: motors that know no speed.
 
     The most that a motor drives with falls on a line from its stall torque at rest to zero at its no-load speed.
     Errors: those of :func:`joint_gains`.
@@ -92,7 +50,7 @@ def motor_lines(robot: RobotConfig) -> NDArray[np.float64] | None:
     if not robot.stall_ratio:
         return None
     stall = robot.stall_ratio * joint_gains(robot)[2]
-    return np.array([[_group(robot, name).max_speed for name in JOINT_NAMES], stall])
+    return np.array([[_group(robot, name).max_speed for name in RobotSpec.of(robot).joints], stall])
 
 
 def _group(robot: RobotConfig, name: str) -> JointGroup:
@@ -103,7 +61,7 @@ def _group(robot: RobotConfig, name: str) -> JointGroup:
 
 
 def build_model(robot: RobotConfig, engine: EngineConfig, table: TableConfig, visual: bool = False) -> mujoco.MjModel:
-    """Compile robot, table, floor and the mocap ball: nq 28, nv 27, nu 21.
+    """Compile robot, table, floor and the mocap ball: nq = 7 + J, nv = 6 + J, nu = J.
 
     Args:
         robot: gains, efforts, armature and nominal pose.
@@ -114,7 +72,7 @@ def build_model(robot: RobotConfig, engine: EngineConfig, table: TableConfig, vi
 
     Errors: :class:`ConfigError` for gains or a pose that do not fit the robot's joints.
     """
-    spec = mujoco.MjSpec.from_file(str(SCENE))
+    spec = read_scene(model_path(robot))
     _set_motors(spec, robot)
     _fit_table(spec, table)
     spec.option.timestep = engine.physics_dt
@@ -126,12 +84,12 @@ def build_model(robot: RobotConfig, engine: EngineConfig, table: TableConfig, vi
             spec.delete(geom)
     spec.add_key(name=NOMINAL_KEY)
     model = spec.compile()
-    model.key(NOMINAL_KEY).qpos[:] = _standing(model, nominal_pose(robot))
+    model.key(NOMINAL_KEY).qpos[:] = _standing(model, nominal_pose(robot), robot.foot_sites)
     return model
 
 
 def _set_motors(spec: mujoco.MjSpec, robot: RobotConfig) -> None:
-    for name, (kp, kd, effort) in zip(JOINT_NAMES, joint_gains(robot).T, strict=True):
+    for name, (kp, kd, effort) in zip(RobotSpec.of(robot).joints, joint_gains(robot).T, strict=True):
         spec.joint(name).armature = robot.armature
         actuator = spec.actuator(name)
         if robot.stall_ratio:
@@ -183,10 +141,10 @@ def _fit_table(spec: mujoco.MjSpec, table: TableConfig) -> None:
         spec.geom(name).pos[0] = side * (table.paddle_half_thickness - 0.0007)
 
 
-def _standing(model: mujoco.MjModel, pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The state (28,) with joints at ``pose`` and the base at such a height that the lowest sole touches the floor."""
+def _standing(model: mujoco.MjModel, pose: NDArray[np.float64], soles: Sequence[str]) -> NDArray[np.float64]:
+    """The state (7 + J,) with joints at ``pose`` and the lowest sole on the floor."""
     data = mujoco.MjData(model)
     data.qpos[7:] = pose
     mujoco.mj_kinematics(model, data)
-    data.qpos[2] -= min(data.site(name).xpos[2] for name in FEET)
+    data.qpos[2] -= min(data.site(name).xpos[2] for name in soles)
     return data.qpos.copy()

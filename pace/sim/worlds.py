@@ -19,7 +19,8 @@ from pace.sim.ball.ball import BallParams, BallSim
 from pace.sim.engine.factory import make_engine
 from pace.sim.kinematics import Kinematics
 from pace.sim.randomization import Randomizer
-from pace.sim.robot import JOINT_NAMES, build_model, nominal_pose
+from pace.sim.robot import build_model, nominal_pose
+from pace.sim.robot_spec import RobotSpec
 from pace.sim.robot_state import RobotState
 
 
@@ -110,8 +111,6 @@ class Worlds(Stateful):
         model: robot and scene; ``None`` builds them from ``config``.
     """
 
-    joint_names = JOINT_NAMES
-
     def __init__(
         self,
         config: SimConfig,
@@ -124,10 +123,11 @@ class Worlds(Stateful):
         self.num_worlds = num_worlds
         self.device = resolve_device(device)
         self.control_dt = config.robot.control_dt
+        self.spec = RobotSpec.of(config.robot)
         self.generator = generator or torch.Generator(self.device).manual_seed(0)
         self.model = model or build_model(config.robot, config.engine, config.ball.table)
         self.engine = make_engine(self.model, config.engine, num_worlds, self.device, config.substeps)
-        self.kinematics = Kinematics(self.model, num_worlds, config.substeps, self.device)
+        self.kinematics = Kinematics(self.model, self.spec.tips, num_worlds, config.substeps, self.device)
         self.ball = BallSim(
             num_worlds,
             self.device,
@@ -151,7 +151,7 @@ class Worlds(Stateful):
         self._allocate()
 
     def _allocate(self) -> None:
-        n, device, joints = self.num_worlds, self.device, len(JOINT_NAMES)
+        n, device, joints = self.num_worlds, self.device, len(self.spec.joints)
         self.nominal = torch.as_tensor(nominal_pose(self.config.robot), dtype=torch.float32, device=device)
         limits = torch.as_tensor(self.model.jnt_range[1:], dtype=torch.float32, device=device)
         self.joint_lower, self.joint_upper = limits[:, 0].contiguous(), limits[:, 1].contiguous()
@@ -227,7 +227,7 @@ class Worlds(Stateful):
         )
 
     def step(self, targets: Tensor) -> None:
-        """One control step towards joint targets (N, 21) rad; ``robot``, ``ball`` and ``ball.events`` are new after it.
+        """One control step towards joint targets (N, J) rad; ``robot``, ``ball`` and ``ball.events`` are new after it.
 
         Order: targets pass the actuator delay (a physics step in which the new target arrives gets the mean of both),
         pushes and the ball's last impulse on the paddle act, the robot moves, then the ball flies the same interval
@@ -264,7 +264,7 @@ class Worlds(Stateful):
         self._derive(mask)
 
     def reset_robot(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
-        """Put the robots of ``mask`` (N,) bool into state qpos (N, 28), qvel (N, 27) and draw their parameters anew."""
+        """Put the robots of ``mask`` (N,) bool into qpos (N, 7 + J), qvel (N, 6 + J); sample their parameters."""
         self.randomizer.draw(mask)
         self._update_delay()
         self.engine.apply_params(mask)

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pace.config.training import TrainConfig, load_train_config
-from pace.sim.robot import JOINT_NAMES, RIGHT_ARM, build_model
+from pace.sim.robot import build_model
+from pace.sim.robot_spec import RobotSpec
 
 Array = NDArray[np.float64]
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")  # told apart by all kinds of vision
@@ -22,13 +23,21 @@ ENDLESS = (
     "reset=evaluation", "serve=mixed", "serve.serves_per_episode=0", "serve.end_after_hit=0",
     "engine=native", "engine.threads=1", "engine.physics_dt=0.002",
 )  # fmt: skip
-#: Columns of the joints that carry the paddle: waist and right arm.
-ARM = [JOINT_NAMES.index(name) for name in (*RIGHT_ARM, "Waist")]
 
 
 @lru_cache
 def _clean_config() -> TrainConfig:
     return load_train_config(["randomization=none", "engine=native", "device=cpu"])
+
+
+def study_spec() -> RobotSpec:
+    """The parts of the robot that the studies without a policy take: the default one."""
+    return RobotSpec.of(_clean_config().robot)
+
+
+def carrying(spec: RobotSpec) -> list[int]:
+    """Columns of the joints that carry the paddle: the arm, and a waist if there is one."""
+    return [column for column, name in enumerate(spec.joints) if name in spec.arm or "Waist" in name]
 
 
 def study_config(**engine: object) -> TrainConfig:
@@ -39,7 +48,7 @@ def study_config(**engine: object) -> TrainConfig:
 
 
 def standing(config: TrainConfig, num_worlds: int) -> Tensor:
-    """States (N, 28): nominal pose, soles on the floor, behind the table."""
+    """States (N, 7 + J): nominal pose, soles on the floor, behind the table."""
     model = build_model(config.robot, config.engine, config.ball.table)
     qpos = torch.as_tensor(model.key_qpos[0], dtype=torch.float32).repeat(num_worlds, 1)
     qpos[:, 0] = -2.0
@@ -47,7 +56,7 @@ def standing(config: TrainConfig, num_worlds: int) -> Tensor:
 
 
 def smooth_swings(nominal: Tensor, num_worlds: int, steps: int, seed: int, arm: float, rest: float) -> Tensor:
-    """Joint targets (T, N, 21) rad round ``nominal`` (21,): a sum of three sines of 0.5 to 2.5 Hz a joint.
+    """Joint targets (T, N, J) rad round ``nominal`` (J,): a sum of three sines of 0.5 to 2.5 Hz a joint.
 
     ``arm`` is the amplitude of the joints that carry the paddle, ``rest`` that of all others.
     """
@@ -58,7 +67,7 @@ def smooth_swings(nominal: Tensor, num_worlds: int, steps: int, seed: int, arm: 
     time = 0.02 * torch.arange(steps).view(-1, 1, 1, 1)
     wave = (share * torch.sin(2 * np.pi * frequency * time + phase)).sum(1)
     amplitude = torch.full((joints,), rest)
-    amplitude[ARM] = arm
+    amplitude[carrying(study_spec())] = arm
     return nominal + amplitude * wave
 
 

@@ -20,8 +20,9 @@ from pace.config.training import load_train_config
 from pace.evaluation.serves import ServeRecorder, play, summarise
 from pace.rl.policies import TaskPolicy, load_policy
 from pace.sim.engine.native import stop_timers
-from pace.sim.robot import JOINT_NAMES, motor_lines
-from pace.studies.common import ENDLESS, Array, markdown, model_of, study_config
+from pace.sim.robot import motor_lines
+from pace.sim.robot_spec import RobotSpec
+from pace.studies.common import ENDLESS, Array, markdown, model_of, study_config, study_spec
 from pace.task.env import TableTennisEnv
 
 ROBOT = "robot=t1"  # the limit is of configs/, not of a policy that was trained before it
@@ -37,9 +38,9 @@ COST_STEPS = 10
 class MotorRecorder(ServeRecorder):
     """What becomes of the serves, and how the motors are used: counts of instants, by joint.
 
-    Attributes: ``instants``; ``fast`` (21,): speed over the motor's greatest; ``over`` (21,): torque over the line of
-    its world (in the last physics step of a control step, like ``joint_torque``); ``held`` (21,): torque at what line
-    and effort allow, or over it; ``fastest`` (21,): largest speed, of the motor's greatest; ``excess`` (21,): largest
+    Attributes: ``instants``; ``fast`` (J,): speed over the motor's greatest; ``over`` (J,): torque over the line of
+    its world (in the last physics step of a control step, like ``joint_torque``); ``held`` (J,): torque at what line
+    and effort allow, or over it; ``fastest`` (J,): largest speed, of the motor's greatest; ``excess`` (J,): largest
     torque over the line, of the effort.
     """
 
@@ -51,7 +52,7 @@ class MotorRecorder(ServeRecorder):
         self._speed, self._stall = torch.as_tensor(lines, dtype=torch.float32)
         self._effort = self._stall / robot.stall_ratio
         self.instants = 0
-        counts = (torch.zeros(len(JOINT_NAMES)) for _ in range(5))
+        counts = (torch.zeros(len(RobotSpec.of(robot).joints)) for _ in range(5))
         self.fast, self.over, self.held, self.fastest, self.excess = counts
 
     def observe(self) -> None:
@@ -72,9 +73,10 @@ class MotorRecorder(ServeRecorder):
 
 @dataclass(frozen=True)
 class Use:
-    """Serves of a policy and use of its motors; arrays (21,): three shares of time, then of greatest speed, effort."""
+    """Serves of a policy and use of its motors; arrays (J,): three shares of time, then of greatest speed, effort."""
 
     policy: str
+    joints: tuple[str, ...]
     case: str
     hit: float
     success: float
@@ -96,7 +98,7 @@ def use(policy: TaskPolicy, case: str, worlds: int, serves: int) -> Use:
     row = summarise("mixed", recorder.records[:-1], (0.0, 0.0), clear)
     shares = (count / recorder.instants for count in (recorder.fast, recorder.over, recorder.held))
     arrays = [array.double().numpy() for array in (*shares, recorder.fastest, recorder.excess)]
-    return Use(policy.source, case, row["hit"], row["success"], row["serves"], *arrays)
+    return Use(policy.source, env.worlds.spec.joints, case, row["hit"], row["success"], row["serves"], *arrays)
 
 
 def uses(runs: Sequence[Path], worlds: int, serves: int) -> list[Use]:
@@ -117,7 +119,7 @@ def table(found: Sequence[Use]) -> str:
     rows = [[f"hit, success (%) of {found[0].serves} serves"]]
     rows[0] += [f"{100 * use.hit:.1f}, {100 * use.success:.1f}" for use in found]
     for group in GROUPS:
-        columns = [i for i, name in enumerate(JOINT_NAMES) if group in name]
+        columns = [i for i, name in enumerate(found[0].joints) if group in name]
         cells = [
             ", ".join(f"{100 * share[columns].mean():.2f}" for share in (use.fast, use.over, use.held))
             + f", {use.fastest[columns].max():.2f}, {use.excess[columns].max():.2f}"
@@ -138,7 +140,7 @@ def cost(worlds: int = 256, repeats: int = 7) -> dict[str, float]:
         config = study_config(physics_dt=0.002)
         model = model_of(dataclasses.replace(config, robot=dataclasses.replace(config.robot, stall_ratio=ratio)))
         batches[case] = (model, Batch(model, worlds, 1))
-    targets = np.random.default_rng(SEED).normal(0.0, 0.3, (worlds, 1, 21))
+    targets = np.random.default_rng(SEED).normal(0.0, 0.3, (worlds, 1, len(study_spec().joints)))
     least = dict.fromkeys(batches, math.inf)
     for _ in range(repeats):
         for case, (model, batch) in batches.items():

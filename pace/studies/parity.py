@@ -20,9 +20,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pace.sim.robot import CONTACT_BODIES
 from pace.sim.worlds import Worlds
-from pace.studies.common import COLOURS, Array, markdown, model_of, smooth_swings, standing, study_config
+from pace.studies.common import COLOURS, Array, markdown, model_of, smooth_swings, standing, study_config, study_spec
 from pace.studies.throws import throw
 
 STEPS = 50  # control steps: one second
@@ -33,9 +32,8 @@ SEED = 11
 #: What is compared with ``native``.
 OTHERS = {"mjwarp": ("mjwarp", 0.0), "native, 1 μrad beside": ("native", NUDGE)}
 
-#: Bodies (a box, a cylinder) whose contacts are found by a general convex algorithm, and their ``body_contact``.
+#: Bodies (a box, a cylinder) whose contacts are found by a general convex algorithm.
 CONVEX_BODIES = ("trunk", "paddle")
-CONVEX = [CONTACT_BODIES.index(body) for body in CONVEX_BODIES]
 
 #: Falls without anything in which the engines are known to differ.
 LIMBS_ELLIPTIC = "falling, limbs only, elliptic cone"
@@ -47,7 +45,7 @@ Balls = list[tuple[Tensor, Tensor]]
 class Play:
     """A second of N worlds: (T, N, ...) after each control step."""
 
-    joints: Array  # (T, N, 21) rad
+    joints: Array  # (T, N, J) rad
     base: Array  # (T, N, 7) m, quaternion
     load: Array  # (T, N, 2) N, vertical force on the feet
     paddle: Array  # (T, N, 12)
@@ -74,7 +72,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class Scenario:
-    """Start velocities (N, 27), joint targets (T, N, 21) rad, whether balls are thrown at the paddle, and which
+    """Start velocities (N, 6 + J), joint targets (T, N, J) rad, whether balls are thrown at the paddle, and which
     bodies touch."""
 
     velocity: Tensor
@@ -87,8 +85,8 @@ class Scenario:
 def scenarios(num_worlds: int, nominal: Tensor) -> dict[str, Scenario]:
     """Standing under shaking joints; falling over, with and without general convex contacts; strikes in mid-swing."""
     generator = torch.Generator().manual_seed(SEED)
-    shaking = torch.randn(STEPS, num_worlds, 21, generator=generator)
-    still = torch.zeros(num_worlds, 27)
+    shaking = torch.randn(STEPS, num_worlds, len(nominal), generator=generator)
+    still = torch.zeros(num_worlds, 6 + len(nominal))
     pushed = still.clone()
     angle = 2 * np.pi * torch.rand(num_worlds, generator=generator)
     pushed[:, 0], pushed[:, 1] = 2.0 * angle.cos(), 2.0 * angle.sin()
@@ -141,7 +139,8 @@ def _look(worlds: Worlds) -> tuple[Array, ...]:
     robot = worlds.robot
     base = torch.cat([robot.base_position, robot.base_quat], dim=1)
     paddle = worlds.kinematics.paddle_path[:, -1]
-    touched = robot.body_contact[:, CONVEX].amax(1)
+    convex = [study_spec().contacts.index(body) for body in CONVEX_BODIES]
+    touched = robot.body_contact[:, convex].amax(1)
     parts = (robot.joint_position, base, robot.foot_force[..., 2], paddle, worlds.ball.velocity, touched)
     return tuple(part.double().numpy().copy() for part in parts)
 

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from pace.evaluation.serves import ServeRecorder, play
 from pace.rl.policies import TaskPolicy, load_policy
-from pace.sim.robot import CONTACT_BODIES
 from pace.studies.common import ENDLESS, markdown
 from pace.task.env import TableTennisEnv
 
@@ -35,13 +34,13 @@ class PostureRecorder(ServeRecorder):
     """How the robots stand and move while they play; robots that are about to fall are left in.
 
     Attributes: ``sums`` (2, len(MEASURES)): sums over instants of each phase, ``instants`` (2,); ``touches``
-    (len(CONTACT_BODIES),): instants at whose end that body touched anything.
+    (B,): instants at whose end each body of ``RobotSpec.contacts`` touched anything.
     """
 
     def __init__(self, env: TableTennisEnv, warmup_serves: int, quota: int) -> None:
         super().__init__(env, warmup_serves, quota)
         self.sums, self.instants = torch.zeros(2, len(MEASURES)), torch.zeros(2)
-        self.touches = torch.zeros(len(CONTACT_BODIES))
+        self.touches = torch.zeros(len(env.worlds.spec.contacts))
         self._down = env.task_state.foot_contact.clone()
 
     def observe(self) -> None:
@@ -67,9 +66,10 @@ class PostureRecorder(ServeRecorder):
 @dataclass(frozen=True)
 class Posture:
     """A policy's means in each phase (2, len(MEASURES)), in the units of MEASURES, its shares of time (2,), and the
-    share of time in which each body of CONTACT_BODIES touched anything."""
+    share of time in which each of its ``bodies`` touched anything."""
 
     policy: str
+    bodies: tuple[str, ...]
     means: Tensor
     phases: Tensor
     touches: Tensor
@@ -82,7 +82,7 @@ def posture(policy: TaskPolicy, name: str, worlds: int, serves: int) -> Posture:
     play(env, policy, recorder)
     total = recorder.instants.sum()
     means = SCALES * recorder.sums / recorder.instants.unsqueeze(1)
-    return Posture(name, means, recorder.instants / total, recorder.touches / total)
+    return Posture(name, env.worlds.spec.contacts, means, recorder.instants / total, recorder.touches / total)
 
 
 def postures(runs: Sequence[Path], worlds: int, serves: int) -> list[Posture]:
@@ -104,7 +104,7 @@ def table(found: Sequence[Posture]) -> str:
 def _touches(one: Posture) -> str:
     seen = [
         f"{body.replace('_', ' ')} {100 * share:.2f}"
-        for body, share in zip(CONTACT_BODIES, one.touches.tolist(), strict=True)
+        for body, share in zip(one.bodies, one.touches.tolist(), strict=True)
         if share > 0
     ]
     return ", ".join(seen) or "none"

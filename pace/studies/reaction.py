@@ -71,7 +71,9 @@ def _play(count: int, speed: Tensor, reaction: bool, gains: float) -> tuple[Tens
     """Swing, strike, follow through: paddle (T, N, 12) after the strike, the worlds, and what the strike was."""
     config = study_config(paddle_reaction=reaction)
     worlds = Worlds(config, count, "cpu")
-    worlds.reset_robot(torch.ones(count, dtype=torch.bool), standing(config, count), torch.zeros(count, 27))
+    worlds.reset_robot(
+        torch.ones(count, dtype=torch.bool), standing(config, count), torch.zeros(count, worlds.model.nv)
+    )
     targets = smooth_swings(worlds.nominal, count, SWING_STEPS + FOLLOW_STEPS + 1, SEED, arm=0.6, rest=0.02)
     for step in range(SWING_STEPS):
         worlds.step(targets[step])
@@ -128,7 +130,7 @@ def cost(num_worlds: int = 1024, repeats: int = 200) -> float:
     config = study_config(paddle_reaction=True)
     worlds = Worlds(config, num_worlds, "cpu")
     everyone = torch.ones(num_worlds, dtype=torch.bool)
-    worlds.reset_robot(everyone, standing(config, num_worlds), torch.zeros(num_worlds, 27))
+    worlds.reset_robot(everyone, standing(config, num_worlds), torch.zeros(num_worlds, worlds.model.nv))
     seconds = []
     for _ in range(repeats):
         started = time.perf_counter()

@@ -11,7 +11,16 @@ from matplotlib.figure import Figure
 
 from pace.sim.engine.factory import make_engine
 from pace.sim.kinematics import Kinematics
-from pace.studies.common import ARM, COLOURS, Array, markdown, model_of, quantiles, study_config
+from pace.studies.common import (
+    COLOURS,
+    Array,
+    carrying,
+    markdown,
+    model_of,
+    quantiles,
+    study_config,
+    study_spec,
+)
 from pace.studies.swings import Windows
 
 ENGINES = ("native", "mjwarp")
@@ -30,7 +39,7 @@ INSTANTS = (5, 15)  # control steps after the start at which errors are quoted
 
 @dataclass(frozen=True)
 class Motion:
-    """Where W windows went: ``joints`` (L, W, 21) rad and ``paddle`` (L, W, 12) after each control step."""
+    """Where W windows went: ``joints`` (L, W, J) rad and ``paddle`` (L, W, 12) after each control step."""
 
     joints: Array
     paddle: Array
@@ -57,7 +66,7 @@ def replay(windows: Windows, engine: dict[str, object], friction_loss: float = 0
     model.dof_frictionloss[6:] = friction_loss
     count = len(windows.qpos)
     robots = make_engine(model, config.engine, count, "cpu", config.substeps)
-    tips = Kinematics(model, count, config.substeps, "cpu")
+    tips = Kinematics(model, study_spec().tips, count, config.substeps, "cpu")
     robots.reset(torch.ones(count, dtype=torch.bool), windows.qpos, windows.qvel)
     still = torch.zeros(count, model.nv)
     joints, paddle, started = [], [], 0.0
@@ -76,7 +85,7 @@ def deviation(motion: Motion, reference: Motion) -> Deviation:
     joints, paddle = motion.joints - reference.joints, motion.paddle - reference.paddle
     return Deviation(
         joints=np.sqrt(np.mean(joints**2, axis=2)),
-        arm=np.sqrt(np.mean(joints[..., ARM] ** 2, axis=2)),
+        arm=np.sqrt(np.mean(joints[..., carrying(study_spec())] ** 2, axis=2)),
         paddle=np.linalg.norm(paddle[..., :3], axis=2),
         speed=np.linalg.norm(paddle[..., 6:9], axis=2),
     )

@@ -18,8 +18,9 @@ SEED = 7
 
 @dataclass(frozen=True)
 class Swings:
-    """T control steps of N worlds. ``qpos`` (T, N, 28), ``qvel`` (T, N, 27): the state before each step; ``targets``
-    (T, N, 21) rad: what the joints are told in it; ``ends`` (T, N) bool: the world is reset behind it; ``source``."""
+    """T control steps of N worlds. ``qpos`` (T, N, 7 + J), ``qvel`` (T, N, 6 + J): the state before each step;
+    ``targets`` (T, N, J) rad: what the joints are told in it; ``ends`` (T, N) bool: the world is reset after
+    it; ``source``."""
 
     qpos: Tensor
     qvel: Tensor
@@ -41,7 +42,7 @@ class Swings:
 
 @dataclass(frozen=True)
 class Windows:
-    """W stretches of motion: states (W, 28), (W, 27) at their start, and ``targets`` (L, W, 21) rad."""
+    """W stretches of motion: states (W, 7 + J), (W, 6 + J) at their start, and ``targets`` (L, W, J) rad."""
 
     qpos: Tensor
     qvel: Tensor
@@ -53,7 +54,7 @@ def random_swings(num_worlds: int, steps: int) -> Swings:
     config = study_config(physics_dt=RECORDED_DT)
     worlds = Worlds(config, num_worlds, "cpu")
     worlds.reset_robot(
-        torch.ones(num_worlds, dtype=torch.bool), standing(config, num_worlds), torch.zeros(num_worlds, 27)
+        torch.ones(num_worlds, dtype=torch.bool), standing(config, num_worlds), torch.zeros(num_worlds, worlds.model.nv)
     )
     targets = smooth_swings(worlds.nominal, num_worlds, steps, SEED, arm=0.6, rest=0.03)
     states = []

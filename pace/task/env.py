@@ -122,9 +122,7 @@ class TableTennisEnv(EnvBase):
         late = config.serve.head_start[1] > 0
         self._head_start = HeadStart(config.serve, worlds.ball, self.generator) if late else None
         limits = (worlds.joint_lower, worlds.joint_upper)
-        self._poses = PoseSampler(
-            config.reset, config.robot, self.num_worlds, worlds.nominal, limits, worlds.joint_names, self.generator
-        )
+        self._poses = PoseSampler(config.reset, config.robot, self.num_worlds, worlds.nominal, limits, self.generator)
         self.game = Game(config, worlds.ball, worlds.robot.base_position)
         self.sensing = Sensing(
             config.sensing, self.num_worlds, device, worlds.control_dt, worlds.nominal, self.generator

@@ -11,7 +11,7 @@ from pace.arrays.launch import Launch
 from pace.config.sim import RobotConfig
 from pace.config.task import ResetConfig, ServeConfig
 from pace.sim.ball.ball import BallSim
-from pace.sim.robot import RIGHT_ARM
+from pace.sim.robot_spec import RobotSpec
 
 
 @wp.kernel
@@ -66,7 +66,6 @@ class PoseSampler:
         num_worlds: int,
         nominal: Tensor,
         limits: tuple[Tensor, Tensor],
-        joint_names: tuple[str, ...],
         generator: torch.Generator,
     ) -> None:
         device, joints = nominal.device, nominal.shape[0]
@@ -79,7 +78,7 @@ class PoseSampler:
         rates = [config.roll_pitch_rate, config.roll_pitch_rate, config.yaw_rate]
         columns += columns_of(self._qvel[:, :6], [*[config.linear_velocity] * 3, *rates])
         ends = zip(*(limit.tolist() for limit in limits), strict=True)
-        ranges = _joint_ranges(config, joint_names, nominal.tolist())
+        ranges = _joint_ranges(config, RobotSpec.of(robot), nominal.tolist())
         columns += columns_of(self._qpos[:, 7:], [(*pair, *end) for pair, end in zip(ranges, ends, strict=True)])
         self._draw = Draws(columns, generator)
         self._turn = Launch(turn, num_worlds, device, yaw=yaw, qpos=self._qpos)
@@ -94,11 +93,11 @@ class PoseSampler:
         return self._qpos, self._qvel
 
 
-def _joint_ranges(config: ResetConfig, names: tuple[str, ...], nominal: list[float]) -> list[tuple[float, float]]:
+def _joint_ranges(config: ResetConfig, spec: RobotSpec, nominal: list[float]) -> list[tuple[float, float]]:
     """Lowest and highest angle of each joint at the start of an episode, rad."""
     ranges = []
-    for name, angle in zip(names, nominal, strict=True):
-        if name in RIGHT_ARM:
+    for name, angle in zip(spec.joints, nominal, strict=True):
+        if name in spec.arm:
             low, high = (angle + end for end in config.right_arm_offset)
         else:
             low, high = (angle * end for end in config.joint_scale)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import torch
@@ -11,10 +10,9 @@ from torch import Tensor
 from pace.arrays.launch import Launch
 from pace.arrays.state import Stateful
 from pace.arrays.tensors import allocate
-from pace.sim.robot import RIGHT_ARM
 from pace.task.game import Game
 from pace.task.measures import Derived, Measures
-from pace.task.state_kernels import derive, measure
+from pace.task.state_kernels import JointArrays, derive, measure
 
 if TYPE_CHECKING:
     from pace.sim.ball.ball import BallSim
@@ -22,18 +20,8 @@ if TYPE_CHECKING:
     from pace.sim.worlds import Worlds
 
 
-def _is_hip_waist_left_arm(name: str) -> bool:
-    left_arm = name.startswith("Left_") and ("Shoulder_Pitch" in name or "Elbow" in name)
-    return left_arm or "Hip_Yaw" in name or "Hip_Roll" in name or name == "Waist"
-
-
-#: Groups of joints that reward terms sum over.
-JOINT_GROUPS: dict[str, Callable[[str], bool]] = {
-    "ankles": lambda name: "Ankle" in name,
-    "hip_waist_left_arm": _is_hip_waist_left_arm,
-    "left_shoulder_roll": lambda name: name == "Left_Shoulder_Roll",
-    "right_arm": RIGHT_ARM.__contains__,
-}
+#: Groups of joints that reward terms sum over: keys of ``robot.groups``; a robot may lack some.
+JOINT_GROUPS = tuple(name for name in JointArrays.vars if name != "nominal")  # type: ignore[attr-defined]
 
 
 class TaskState(Derived, Stateful):
@@ -91,9 +79,10 @@ class TaskState(Derived, Stateful):
             nominal=self.nominal,
             rules=game.rules,
         )
+        joints, members = worlds.spec.joints, worlds.spec.groups
         groups = {
-            group: torch.tensor([float(belongs(name)) for name in worlds.joint_names], device=device)
-            for group, belongs in JOINT_GROUPS.items()
+            group: torch.tensor([float(name in members.get(group, ())) for name in joints], device=device)
+            for group in JOINT_GROUPS
         }
         self._measure = Launch(
             measure,

@@ -38,9 +38,10 @@ from pace.rl.agent import Policy
 from pace.rl.policies import TaskPolicy, built_in_policy, load_policy, policy_size
 from pace.sim.ball.ball import BallParams, BallSim, ball_preset
 from pace.sim.kinematics import Kinematics
-from pace.sim.robot import JOINT_NAMES, build_model
+from pace.sim.robot import build_model
 from pace.task.game import rules_of
 from pace.task.observations import BallTrack
+from tests.helpers.robot import JOINT_NAMES, SPEC
 from tests.helpers.saved import make_agent, make_config, remembering_policy, save_run
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "deploy_sim2sim.py"
@@ -281,7 +282,7 @@ def test_paddle_and_base_as_the_kernels_have_them() -> None:
     rotation = base_rotation(-truth[:, 2], truth[:, :2, 0])
     assert torch.allclose(rotation, truth, atol=1e-5)
     centre, normal = PaddleChain(model)(position, rotation, joints)
-    expected = Kinematics(model, count, 1, "cpu").paddle_pose(position, quat, joints)
+    expected = Kinematics(model, SPEC.tips, count, 1, "cpu").paddle_pose(position, quat, joints)
     assert torch.allclose(centre, expected[0], atol=1e-5)
     assert torch.allclose(normal, expected[1], atol=1e-5)
 

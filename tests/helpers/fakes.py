@@ -15,14 +15,9 @@ from pace.config.training import load_train_config
 from pace.sim.ball.ball import BallEvents, Forecast
 from pace.task.game import Game
 from pace.task.state import TaskState
+from tests.helpers.robot import SPEC
 
 CPU = torch.device("cpu")
-JOINT_NAMES = (
-    "Left_Shoulder_Pitch", "Left_Shoulder_Roll", "Left_Elbow_Pitch", "Left_Elbow_Yaw",
-    "Right_Shoulder_Pitch", "Right_Shoulder_Roll", "Right_Elbow_Pitch", "Right_Elbow_Yaw", "Waist",
-    "Left_Hip_Pitch", "Left_Hip_Roll", "Left_Hip_Yaw", "Left_Knee_Pitch", "Left_Ankle_Pitch", "Left_Ankle_Roll",
-    "Right_Hip_Pitch", "Right_Hip_Roll", "Right_Hip_Yaw", "Right_Knee_Pitch", "Right_Ankle_Pitch", "Right_Ankle_Roll",
-)  # fmt: skip
 
 
 @lru_cache
@@ -92,7 +87,7 @@ def fake_worlds(n: int) -> Any:
     return SimpleNamespace(
         num_worlds=n, device=CPU, control_dt=0.02, robot=fake_robot(n), ball=fake_ball(n),
         nominal=torch.linspace(-0.5, 0.5, 21), joint_lower=torch.full((21,), -1.0),
-        joint_upper=torch.full((21,), 1.0), joint_names=JOINT_NAMES, kinematics=FakeKinematics(),
+        joint_upper=torch.full((21,), 1.0), spec=SPEC, kinematics=FakeKinematics(),
     )  # fmt: skip
 
 

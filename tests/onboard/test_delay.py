@@ -111,7 +111,7 @@ def test_a_simulated_robot_finds_its_delay() -> None:
     """Robots that swing at the waist: the estimate follows the simulation's delay, which it never sees."""
     settings = ["observation=memory", "sensing=wide", *NO_NOISE, "engine.threads=1", "engine.physics_dt=0.002"]
     env = make_env(32, "native", "cpu", overrides=[*settings, "sensing.mocap_delay=[0.0,0.04]"])
-    waist = env.worlds.joint_names.index("Waist")
+    waist = env.worlds.spec.joints.index("Waist")
     delay = env.sensing.delay * DT
     for step in range(40):
         action = torch.zeros(32, 21)

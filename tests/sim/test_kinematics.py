@@ -8,6 +8,7 @@ import torch
 from pace.config.training import load_train_config
 from pace.sim.kinematics import Kinematics
 from pace.sim.robot import build_model
+from tests.helpers.robot import SPEC
 
 WORLDS, SUBSTEPS = 6, 3
 #: float32 against float64 at lengths of about 3 m and speeds of about 10 m/s
@@ -30,7 +31,7 @@ def path(model):
 
 @pytest.fixture(scope="module")
 def kinematics(model, path):
-    kinematics = Kinematics(model, WORLDS, SUBSTEPS, "cpu")
+    kinematics = Kinematics(model, SPEC.tips, WORLDS, SUBSTEPS, "cpu")
     kinematics.update(*(torch.tensor(p, dtype=torch.float32) for p in path))
     return kinematics
 
@@ -102,7 +103,7 @@ def test_generalized_force_is_the_jacobian_transpose(model, path, kinematics):
 
 
 def test_outputs_stay_the_same_tensors(model, path):
-    kinematics = Kinematics(model, WORLDS, SUBSTEPS, "cpu")
+    kinematics = Kinematics(model, SPEC.tips, WORLDS, SUBSTEPS, "cpu")
     before = [kinematics.paddle_path.data_ptr(), kinematics.foot_up.data_ptr()]
     tensors = [torch.tensor(p, dtype=torch.float32) for p in path]
     kinematics.update(*tensors)
@@ -114,7 +115,7 @@ def test_outputs_stay_the_same_tensors(model, path):
 
 
 def test_masked_worlds_are_updated_alone(model, path):
-    kinematics = Kinematics(model, WORLDS, SUBSTEPS, "cpu")
+    kinematics = Kinematics(model, SPEC.tips, WORLDS, SUBSTEPS, "cpu")
     positions, velocities = (torch.tensor(p, dtype=torch.float32) for p in path)
     kinematics.update(positions, velocities)
     outputs = (kinematics.paddle_path, kinematics.foot_position, kinematics.head_position)
@@ -130,7 +131,7 @@ def test_masked_worlds_are_updated_alone(model, path):
 
 
 def test_wrong_shapes_and_order_are_clear_errors(model):
-    kinematics = Kinematics(model, WORLDS, SUBSTEPS, "cpu")
+    kinematics = Kinematics(model, SPEC.tips, WORLDS, SUBSTEPS, "cpu")
     with pytest.raises(RuntimeError, match="call update"):
         kinematics.paddle_generalized_force(torch.zeros(WORLDS, 3), torch.zeros(WORLDS, 3), torch.zeros(WORLDS, 27))
     with pytest.raises(ValueError, match=r"qpos_path must have shape \(6, 4, 28\)"):

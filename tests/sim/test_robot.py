@@ -8,7 +8,8 @@ import pytest
 
 from pace.config.base import ConfigError
 from pace.config.training import load_train_config
-from pace.sim.robot import CONTACT_BODIES, JOINT_NAMES, NOMINAL_KEY, build_model, joint_gains, nominal_pose
+from pace.sim.robot import NOMINAL_KEY, build_model, joint_gains, nominal_pose
+from tests.helpers.robot import CONTACT_BODIES, JOINT_NAMES
 
 #: joint: (lower, upper, effort) in rad and N m, from the maker's description; every other joint mirrors its sibling.
 LIMITS = {

@@ -11,7 +11,8 @@ import torch
 from pace.task.game import Outcome
 from pace.task.resets import PoseSampler, ServeSampler
 from pace.task.state import TaskState
-from tests.helpers.fakes import CPU, JOINT_NAMES, config, fake_game, set_events
+from tests.helpers.fakes import CPU, config, fake_game, set_events
+from tests.helpers.robot import JOINT_NAMES
 
 YES = torch.ones(1, dtype=torch.bool)
 BOUNCE: dict[str, Any] = {"own_bounce": 0.010}
@@ -306,7 +307,7 @@ def test_poses_are_drawn_in_range_and_within_joint_limits() -> None:
     nominal = torch.linspace(-0.6, 0.6, 21)
     limits = (torch.full((21,), -0.8), torch.full((21,), 0.8))
     generator = torch.Generator().manual_seed(0)
-    sampler = PoseSampler(task.reset, task.robot, 2000, nominal, limits, JOINT_NAMES, generator)
+    sampler = PoseSampler(task.reset, task.robot, 2000, nominal, limits, generator)
     qpos, qvel = sampler.sample(torch.ones(2000, dtype=torch.bool))
     assert qpos.shape == (2000, 28)
     assert qvel.shape == (2000, 27)

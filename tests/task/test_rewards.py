@@ -18,7 +18,8 @@ from pace.sim.ball.aero import GRAVITY
 from pace.sim.ball.ball import BallParams, BallSim
 from pace.task.rewards import TERMS, RewardFunction, RewardManager, paddle_speed
 from pace.task.state import JOINT_GROUPS, TaskState
-from tests.helpers.fakes import CPU, JOINT_NAMES, config, fake_state, set_events
+from tests.helpers.fakes import CPU, config, fake_state, set_events
+from tests.helpers.robot import JOINT_NAMES, SPEC
 
 PAPER_TASK = config("reward=paper")
 PAPER = PAPER_TASK.reward
@@ -60,9 +61,7 @@ def test_measures_are_the_torch_formulas_on_random_states() -> None:
     state.refresh()
     action = state.action - state.previous_action
     watts, deviation = robot.joint_torque * robot.joint_velocity, (robot.joint_position - state.nominal).abs()
-    groups = {
-        name: torch.tensor([float(belongs(joint)) for joint in JOINT_NAMES]) for name, belongs in JOINT_GROUPS.items()
-    }
+    groups = {name: torch.tensor([float(joint in SPEC.groups[name]) for joint in JOINT_NAMES]) for name in JOINT_GROUPS}
     horizontal = robot.foot_force[..., :2].norm(dim=-1) / robot.foot_force[..., 2].abs()
     expected = {
         "joint_power": watts.norm(dim=1),

@@ -15,7 +15,7 @@ from pace.arrays.launch import Bound, MaskedLaunch
 from pace.arrays.state import Stateful, tensors_named
 from pace.arrays.tensors import Float, Start, Vec3, allocate
 from pace.config.base import ConfigError
-from pace.sim.robot import FEET
+from pace.sim.robot_spec import FEET
 
 Unit = Annotated[Float, Start(1.0)]
 
@@ -47,12 +47,12 @@ class RobotEngine(Protocol):
     """N worlds with one robot each. Tensors are float32 on ``device`` and the same objects for ever.
 
     Attributes:
-        qpos_path, qvel_path: (N, S + 1, 28) and (N, S + 1, 27): the states at the S + 1 physics instants of the last
-            control step, 0 its start and S its end. MuJoCo's conventions: quaternion w, x, y, z; linear velocity of
-            the base in the world frame, its angular velocity in the body frame.
+        qpos_path, qvel_path: (N, S + 1, 7 + J) and (N, S + 1, 6 + J): the states at the S + 1 physics instants of the
+            last control step, 0 its start and S its end. MuJoCo's conventions: quaternion w, x, y, z; linear velocity
+            of the base in the world frame, its angular velocity in the body frame.
         foot_force: (N, 2, 3) N, world frame: net contact force on the left and right foot in the last physics step.
-        body_contact: (N, len(CONTACT_BODIES)): 1 where that body touched anything in the last physics step.
-        joint_torque: (N, 21) N m: what the motors gave in the last physics step.
+        body_contact: (N, B): 1 where that body of ``RobotSpec.contacts`` touched anything in the last physics step.
+        joint_torque: (N, J) N m: what the motors gave in the last physics step.
         params: physical parameters of each world.
     """
 
@@ -70,13 +70,13 @@ class RobotEngine(Protocol):
     def advance(self, targets: Tensor, applied: Tensor) -> None:
         """Play one control step.
 
-        Args: targets (N, S, 21) rad: joint targets of each physics step; applied (N, 27): generalized force (N, N m)
+        Args: targets (N, S, J) rad: joint targets of each physics step; applied (N, 6 + J): generalized force (N, N m)
         held over the control step.
         """
         ...
 
     def reset(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
-        """Put the worlds of ``mask`` (N,) bool into the state qpos (N, 28), qvel (N, 27).
+        """Put the worlds of ``mask`` (N,) bool into the state qpos (N, 7 + J), qvel (N, 6 + J).
 
         Their whole path holds that state, their forces and contacts are zero, and the solver forgets its warm start.
         """
@@ -87,7 +87,7 @@ class RobotEngine(Protocol):
         ...
 
     def add_velocity(self, delta: Tensor) -> None:
-        """Add ``delta`` (N, 27) to the velocities with which the next control step starts."""
+        """Add ``delta`` (N, 6 + J) to the velocities with which the next control step starts."""
         ...
 
     def overflowed(self) -> bool:
@@ -125,15 +125,15 @@ class StateTensors(Stateful):
         self.params = EngineParams.nominal(model, num_worlds, device)
         self.qpos_path = torch.zeros(num_worlds, substeps + 1, model.nq, device=device)
         self.qvel_path = torch.zeros(num_worlds, substeps + 1, model.nv, device=device)
-        self.foot_force = torch.zeros(num_worlds, len(FEET), 3, device=device)
-        self.body_contact = torch.zeros(num_worlds, model.nsensordata - 3 * len(FEET), device=device)
+        self.foot_force = torch.zeros(num_worlds, FEET, 3, device=device)
+        self.body_contact = torch.zeros(num_worlds, model.nsensordata - 3 * FEET, device=device)
         self.joint_torque = torch.zeros(num_worlds, model.nu, device=device)
         self.qpos_path.copy_(torch.as_tensor(model.key_qpos[0], dtype=torch.float32))
         starts = {"qpos": (num_worlds, model.nq), "qvel": (num_worlds, model.nv)}
         self._reset = Bound(self._record_reset, **starts)
 
     def _solver_state(self) -> dict[str, Tensor]:
-        """qpos (N, 28), qvel (N, 27) and warmstart (N, 27) of the engine itself, in its precision."""
+        """qpos (N, 7 + J), qvel and warmstart (N, 6 + J) of the engine itself, in its precision."""
         raise NotImplementedError
 
     def reset(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:

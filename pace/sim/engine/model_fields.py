@@ -12,7 +12,6 @@ from torch import Tensor
 from pace.arrays.launch import MaskedLaunch
 from pace.arrays.share import share
 from pace.sim.engine.base import EngineParams
-from pace.sim.robot import TRUNK_BODY
 
 
 @wp.struct
@@ -90,7 +89,7 @@ class ModelFields:
 
 def _body(model: mujoco.MjModel, params: EngineParams) -> Iterator[Change]:
     """Friction, and the trunk with what is bolted to it; its inertia grows in proportion to its mass."""
-    trunk = int(model.body(TRUNK_BODY).id)
+    trunk = int(model.jnt_bodyid[0])  # the free joint's
     mass, inertia = model.body_mass[trunk], model.body_inertia[trunk]
     yield Change("pair_friction", (slice(None), slice(2)), params.friction, 0.0, 1.0)  # both directions
     yield Change("body_mass", (trunk,), params.trunk_mass, mass, 1.0)

@@ -15,7 +15,6 @@ from pace.config.base import ConfigError
 from pace.config.training import load_train_config
 from pace.sim.ball.aero import GRAVITY
 from pace.sim.ball.ball import DEFAULT_PRESET, BallEvents, BallParams, BallSim, ball_preset
-from pace.sim.robot import JOINT_NAMES
 from pace.sim.worlds import Worlds
 from pace.studies import ball_reference as reference
 from pace.studies.ball_trials import (
@@ -32,6 +31,7 @@ from pace.studies.ball_trials import (
     put,
     random_strikes,
 )
+from tests.helpers.robot import JOINT_NAMES
 
 DT = CONTROL_DT
 TOP = TABLE.height

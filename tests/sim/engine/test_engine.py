@@ -13,7 +13,8 @@ from pace.devices import resolve_device
 from pace.sim.engine.base import EngineParams
 from pace.sim.engine.factory import make_engine
 from pace.sim.engine.native import NativeEngine
-from pace.sim.robot import CONTACT_BODIES, JOINT_NAMES, build_model, nominal_pose
+from pace.sim.robot import build_model, nominal_pose
+from tests.helpers.robot import CONTACT_BODIES, JOINT_NAMES
 
 WORLDS = 4
 CONFIG = load_train_config()

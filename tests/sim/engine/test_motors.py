@@ -11,7 +11,8 @@ import torch
 from pace.config.base import ConfigError, parse, to_dict
 from pace.config.training import load_train_config
 from pace.sim.engine.factory import make_engine
-from pace.sim.robot import JOINT_NAMES, build_model, joint_gains, motor_lines
+from pace.sim.robot import build_model, joint_gains, motor_lines
+from tests.helpers.robot import JOINT_NAMES
 
 CONFIG = load_train_config()
 WORLDS = 8

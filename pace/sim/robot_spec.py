@@ -1,0 +1,134 @@
+"""What a robot is made of: the names of its parts, read from its MJCF and the configuration.
+
+Another robot is another MJCF and another ``configs/robot/<name>.yaml``; nothing else in the package names a joint.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import mujoco
+
+from pace.config.base import ConfigError
+from pace.config.sim import RobotConfig
+
+ASSETS = Path(__file__).parent / "assets"
+#: Suffix of the sensors that count the contacts of a geom.
+TOUCH = "_touch"
+FEET = 2  # left and right
+
+
+@dataclass(frozen=True)
+class RobotSpec:
+    """Names of a robot's parts, in the order of the simulation's arrays.
+
+    Attributes:
+        joints: the J actuated joints, in the order of actions, of ``qpos[7:]`` and of ``qvel[6:]``.
+        arm: those of the joints between trunk and paddle, past the waist.
+        contacts: geoms other than the feet that can touch floor, table or paddle, in the order of ``body_contact``.
+        paddle: site at the centre of the blade; the x axis of its link is the normal of the face.
+        feet: sites at the centres of the left and the right sole.
+        head: site at the middle of the head.
+        groups: joints by the name of the group that reward terms sum over.
+    """
+
+    joints: tuple[str, ...]
+    arm: tuple[str, ...]
+    contacts: tuple[str, ...]
+    paddle: str
+    feet: tuple[str, ...]
+    head: str
+    groups: dict[str, tuple[str, ...]]
+
+    @property
+    def tips(self) -> tuple[str, ...]:
+        """Sites whose motion is followed: paddle, left and right foot, head."""
+        return (self.paddle, *self.feet, self.head)
+
+    @classmethod
+    def of(cls, robot: RobotConfig) -> RobotSpec:
+        """The robot that the configuration names.
+
+        Errors: :class:`ConfigError` for an MJCF that cannot be read, or that lacks a part, or a free base.
+        """
+        found = _parts(model_path(robot))
+        _check(robot, found)
+        return cls(
+            joints=found.joints,
+            arm=_matching(found.joints, robot.arm),
+            contacts=found.contacts,
+            paddle=robot.paddle_site,
+            feet=tuple(robot.foot_sites),
+            head=robot.head_site,
+            groups={name: _matching(found.joints, parts) for name, parts in robot.groups.items()},
+        )
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Names that an MJCF gives: actuated joints, sites, and geoms whose contacts are counted."""
+
+    joints: tuple[str, ...]
+    sites: tuple[str, ...]
+    contacts: tuple[str, ...]
+
+
+def model_path(robot: RobotConfig) -> Path:
+    """The robot's MJCF: ``robot.model``, a file of this package's assets or any other path.
+
+    Errors: :class:`ConfigError` for a file that is not there.
+    """
+    for path in (ASSETS / robot.model, Path(robot.model)):
+        if path.is_file():
+            return path
+    raise ConfigError(f"robot.model: no file {robot.model} in {ASSETS} or in the working folder")
+
+
+def read_scene(path: Path) -> mujoco.MjSpec:
+    """Floor, table, net and ball with the robot of the MJCF ``path``, not yet compiled.
+
+    Errors: :class:`ConfigError` for a file that MuJoCo cannot read.
+    """
+    scene = (ASSETS / "scene.xml").read_text()
+    try:
+        spec = mujoco.MjSpec.from_string(scene, include={"robot.xml": path.read_bytes()})
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"robot.model {path}: {str(error).splitlines()[0]}") from error
+    spec.modelfiledir = str(path.parent)  # where its meshes are, if it has any
+    return spec
+
+
+@lru_cache
+def _parts(path: Path) -> Parts:
+    spec = read_scene(path)
+    sensors = [sensor.name for sensor in spec.sensors]
+    contacts = tuple(name.removesuffix(TOUCH) for name in sensors if name.endswith(TOUCH))
+    free = [joint.name for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
+    joints = tuple(joint.name for joint in spec.joints if joint.name not in free)
+    if len(free) != 1 or spec.joints[0].name != free[0]:
+        raise ConfigError(f"robot.model {path}: the base must have the first and only free joint, found {free}")
+    moved = tuple(actuator.target for actuator in spec.actuators)
+    if moved != joints:
+        raise ConfigError(f"robot.model {path}: every joint needs one actuator, in the order of the joints")
+    return Parts(joints, tuple(site.name for site in spec.sites), contacts)
+
+
+def _check(robot: RobotConfig, found: Parts) -> None:
+    sites = {"paddle_site": [robot.paddle_site], "head_site": [robot.head_site], "foot_sites": robot.foot_sites}
+    for key, names in sites.items():
+        missing = [name for name in names if name not in found.sites]
+        if missing:
+            raise ConfigError(f"robot.{key}: {robot.model} has no site {', '.join(missing)}")
+    for key, parts in {"arm": robot.arm, **{f"groups.{name}": parts for name, parts in robot.groups.items()}}.items():
+        unknown = [part for part in parts if not _matching(found.joints, [part])]
+        if unknown:
+            raise ConfigError(f"robot.{key}: no joint of {robot.model} has {', '.join(unknown)} in its name")
+
+
+def _matching(joints: Iterable[str], parts: Iterable[str]) -> tuple[str, ...]:
+    """The joints whose name contains one of ``parts``."""
+    wanted = tuple(parts)
+    return tuple(name for name in joints if any(part in name for part in wanted))
