@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from pace.evaluation.keep import keep, main
+from pace.evaluation.keep import main
+from pace.evaluation.publish import keep
 from pace.rl.policies import load_policy
 from tests.helpers.saved import save_run
 
@@ -20,7 +21,14 @@ EVALUATED = {
 }  # fmt: skip
 
 
-def test_the_kept_policy_acts_like_the_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def run_main(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    monkeypatch.setattr("sys.argv", ["keep", *arguments])
+    return main()
+
+
+def test_the_kept_policy_acts_like_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     run = save_run(tmp_path / "run")
     (run / "metrics.csv").write_text("update,samples\n3,99\n")
     evaluation = tmp_path / "evaluation"
@@ -30,7 +38,7 @@ def test_the_kept_policy_acts_like_the_run(tmp_path: Path, capsys: pytest.Captur
     (tmp_path / "notes.md").write_text("Made by a test.\n")
     kept = tmp_path / "pretrained" / "mine"
     extra = ["--evaluation", str(evaluation), "--notes", str(tmp_path / "notes.md")]
-    assert main([str(run), str(kept), *extra]) == 0
+    assert run_main(monkeypatch, str(run), str(kept), *extra) == 0
     assert "metrics.csv" in capsys.readouterr().out
     names = {file.name for file in kept.iterdir()}
     files = {"checkpoint.json", "weights.safetensors", "metrics.csv", "evaluation.json", "sweep.json", "README.md"}
@@ -38,7 +46,7 @@ def test_the_kept_policy_acts_like_the_run(tmp_path: Path, capsys: pytest.Captur
     before, after = load_policy(run), load_policy(kept)
     observation = torch.randn(5, 450)
     torch.testing.assert_close(after(observation), before(observation), atol=1e-6, rtol=0)
-    assert (after.config.engine.name, after.config.engine.threads, after.config.run_dir) == ("auto", 0, None)
+    assert (after.config.engine.name, after.config.engine.threads, after.config.out) == ("auto", 0, None)
 
 
 def test_the_card_says_what_it_is_and_how_to_play_its_table(tmp_path: Path) -> None:
@@ -61,11 +69,13 @@ def test_the_card_says_what_it_is_and_how_to_play_its_table(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("case", ["no run", "no evaluation", "no notes"])
-def test_wrong_folders_are_one_line(case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_folders_are_one_line(
+    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     run = tmp_path / "nothing" if case == "no run" else save_run(tmp_path / "run")
     extra = ["--evaluation", str(tmp_path)] if case == "no evaluation" else []
     extra += ["--notes", str(tmp_path / "none.md")] if case == "no notes" else []
-    assert main([str(run), str(tmp_path / "kept"), *extra]) == 1
+    assert run_main(monkeypatch, str(run), str(tmp_path / "kept"), *extra) == 1
     error = capsys.readouterr().err
     assert error.startswith("error: ")
     assert error.count("\n") == 1
