@@ -124,10 +124,10 @@ def check_keys(name: str, command: Command, arguments: Sequence[str]) -> None:
         root = key.replace("/", ".").replace("@", ".").split(".")[0]
         if key in command.refused:
             raise ConfigError(f"{key}= is no key of pace {name}: {command.refused[key]}")
+        if "=" not in argument and not argument.startswith("~"):
+            raise ConfigError(f"'{argument}' is no key=value (--help lists the keys)")
         if root in (*known, "hydra"):
             continue
-        if "=" not in argument and not argument.startswith("~"):
-            raise ConfigError(f"'{argument}' is no key=value{meant(argument, known)}")
         raise ConfigError(_unknown(name, root, known))
 
 

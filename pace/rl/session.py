@@ -21,6 +21,7 @@ from pace.devices import resolve_device, threads_of
 from pace.distributed import Team, own_device, suitable_size, team_of
 from pace.predictor.network import PredictorNetwork
 from pace.rl.curriculum import Curriculum
+from pace.rl.policies import locate
 from pace.rl.trainer import Summary, Trainer, begins_anew, played_on
 from pace.runs.checkpoint import Checkpoint, CheckpointError, load_checkpoint
 from pace.runs.progress import rate_texts
@@ -118,10 +119,10 @@ def first_weights(config: TrainConfig) -> Checkpoint | None:
 
     Errors: :class:`CheckpointError` for one that cannot be read.
     """
-    start = load_checkpoint(config.init_from, weights_only=True) if config.init_from else None
+    start = load_checkpoint(locate(config.init_from), weights_only=True) if config.init_from else None
     if not config.predictor_from:
         return start
-    given = load_checkpoint(config.predictor_from, weights_only=True)
+    given = load_checkpoint(locate(config.predictor_from), weights_only=True)
     if "predictor" not in given.weights:
         raise CheckpointError(f"{given.path} has no predictor: give predictor_from a run of pace predictor")
     if start is None:
