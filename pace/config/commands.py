@@ -101,7 +101,7 @@ class EvaluateConfig:
 
 @dataclass
 class ExportConfig:
-    """``python -m pace.deploy.export``: which policy, where to, and how it is checked."""
+    """``python -m pace.deploy``: which policy, where to, and how it is checked."""
 
     run: str | None
     out: str | None  # folder; null: runs/<date>_export

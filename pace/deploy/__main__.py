@@ -18,10 +18,7 @@ def load() -> Work:
     from pace.deploy.export import ExportError, export_from_config
     from pace.runs.checkpoint import CheckpointError
 
-    return export_from_config, (
-        ExportError,
-        CheckpointError,
-    )
+    return export_from_config, (ExportError, CheckpointError)
 
 
 if __name__ == "__main__":

@@ -19,10 +19,7 @@ def load() -> Work:
     from pace.evaluation.serves import EvaluationError
     from pace.runs.checkpoint import CheckpointError
 
-    return evaluate_from_config, (
-        EvaluationError,
-        CheckpointError,
-    )
+    return evaluate_from_config, (EvaluationError, CheckpointError)
 
 
 if __name__ == "__main__":

@@ -18,10 +18,7 @@ def load() -> Work:
     from pace.evaluation.publish import KeepError, keep_from_config
     from pace.runs.checkpoint import CheckpointError
 
-    return keep_from_config, (
-        KeepError,
-        CheckpointError,
-    )
+    return keep_from_config, (KeepError, CheckpointError)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from pace.config.base import parse
 from pace.config.commands import KeepConfig
 from pace.evaluation.card import CARD, card
 from pace.rl.policies import locate
-from pace.runs.checkpoint import META, WEIGHTS, CheckpointError, export_weights, find_checkpoint
+from pace.runs.checkpoint import FOLDER, META, WEIGHTS, CheckpointError, export_weights, find_checkpoint
 from pace.runs.metrics import write_slim
 from pace.runs.run_folder import METRICS
 
@@ -97,14 +97,15 @@ def is_published(folder: Path) -> bool:
 def write_policy(folder: Path, checkpoint: Path, evaluation: Path | None, notes: str) -> list[str]:
     """Write all of a published policy into the new ``folder``; returns the names of the files."""
     export_weights(checkpoint, folder)
-    run = checkpoint.parent.parent
-    sources = [checkpoint.parent.parent / name for name in RUN_FILES]
+    of_a_run = checkpoint.parent.name == FOLDER  # or else of a published policy, whose metrics are short already
+    run = checkpoint.parent.parent if of_a_run else checkpoint
+    sources = [run / name for name in RUN_FILES]
     sources += [evaluation / name for name in EVALUATION_FILES + SWEEP_FILES] if evaluation is not None else []
     for source in sources:
         if source.is_file():
             shutil.copyfile(source, folder / source.name)
     if (run / METRICS).is_file():
-        write_slim(run / METRICS, folder / METRICS)
+        (write_slim if of_a_run else shutil.copyfile)(run / METRICS, folder / METRICS)
     (folder / CARD).write_text(card(folder, notes))
     return sorted(file.name for file in folder.iterdir())
 

@@ -20,11 +20,7 @@ def load() -> Work:
     from pace.rl.session import train_from_config
     from pace.runs.checkpoint import CheckpointError
 
-    return train_from_config, (
-        TeamError,
-        RolloutError,
-        CheckpointError,
-    )
+    return train_from_config, (TeamError, RolloutError, CheckpointError)
 
 
 if __name__ == "__main__":

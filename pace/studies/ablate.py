@@ -18,10 +18,7 @@ def load() -> Work:
     from pace.runs.checkpoint import CheckpointError
     from pace.studies.ablation import AblationError, ablate_from_config
 
-    return ablate_from_config, (
-        CheckpointError,
-        AblationError,
-    )
+    return ablate_from_config, (CheckpointError, AblationError)
 
 
 if __name__ == "__main__":

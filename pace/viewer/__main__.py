@@ -20,11 +20,7 @@ def load() -> Work:
     from pace.viewer.play import play_from_config
     from pace.viewer.web import PageError
 
-    return play_from_config, (
-        CheckpointError,
-        RenderError,
-        PageError,
-    )
+    return play_from_config, (CheckpointError, RenderError, PageError)
 
 
 if __name__ == "__main__":

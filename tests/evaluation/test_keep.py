@@ -142,6 +142,14 @@ def test_the_policies_of_the_repository_can_be_replaced(tmp_path: Path) -> None:
         assert "README.md" in {file.name for file in keep(run, tmp_path / policy.name)}
 
 
+def test_a_published_policy_can_be_published_again_elsewhere(tmp_path: Path) -> None:
+    old = Path("pretrained/pace")
+    keep(old, tmp_path / "new", old, "Another note.")
+    assert (tmp_path / "new" / "metrics.csv").read_text() == (old / "metrics.csv").read_text()
+    assert (tmp_path / "new" / "versions.json").read_bytes() == (old / "versions.json").read_bytes()
+    assert "Another note." in (tmp_path / "new" / "README.md").read_text()
+
+
 def test_a_policy_that_cannot_be_finished_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = save_run(tmp_path / "run")
     keep(run, tmp_path / "kept", notes="Old note.")
