@@ -29,9 +29,10 @@ def prepare(name: str, arguments: Sequence[str]) -> list[str]:
         given = name_list(given, command.rest)
     check_renamed(plain_overrides(given))
     check_keys(name, command, given)
-    if not command.collected:
-        return given
-    return collect_overrides(given, (*command.groups, *command.training_keys))
+    if command.collected:
+        given = collect_overrides(given, (*command.groups, *command.training_keys))
+    changes = [index for index in range(len(given)) if is_override(given, index)]  # Hydra wants them side by side
+    return [given[i] for i in changes] + [argument for i, argument in enumerate(given) if i not in changes]
 
 
 def name_options(arguments: list[str], command: Command) -> list[str]:
@@ -111,14 +112,18 @@ def _text(value: str) -> str:
 
 def plain_overrides(arguments: Sequence[str]) -> list[str]:
     """Those arguments that change the configuration."""
-    pairs = enumerate(arguments)
-    return [a for i, a in pairs if not a.startswith("-") and (i == 0 or arguments[i - 1] not in HYDRA_OPTIONS)]
+    return [argument for index, argument in enumerate(arguments) if is_override(arguments, index)]
+
+
+def is_override(arguments: Sequence[str], index: int) -> bool:
+    """Whether an argument is no option, and no value of one."""
+    return not arguments[index].startswith("-") and (index == 0 or arguments[index - 1] not in HYDRA_OPTIONS)
 
 
 def check_keys(name: str, command: Command, arguments: Sequence[str]) -> None:
     """Errors: :class:`ConfigError` for an argument whose key the command does not have, or would not look at."""
     own = {key.split(".")[0] for key in command_keys(command)}
-    known = [*own, *command.groups, *command.training_keys, "overrides"]
+    known = [*own, *command.groups, *command.training_keys]
     for argument in plain_overrides(arguments):
         key, _ = split_override(argument)
         root = key.replace("/", ".").replace("@", ".").split(".")[0]

@@ -94,6 +94,23 @@ def test_a_group_is_shown_with_the_units_of_its_file() -> None:
     assert "_table" not in rubber
 
 
+def test_options_of_hydra_may_stand_anywhere(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(monkeypatch, "evaluate", "runs/a", "--cfg", "job", "ball=paper", "serves=7") == 0
+    printed = capsys.readouterr().out
+    assert "serves: 7" in printed
+    assert "- ball=paper" in printed
+
+
+def test_help_may_stand_before_the_run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    texts = []
+    for arguments in (("--help", "runs/a"), ("runs/a", "--help"), ("-h",)):
+        assert run(monkeypatch, "evaluate", *arguments) == 0
+        texts.append(capsys.readouterr().out)
+    assert texts[0] == texts[1] == texts[2]
+
+
 @pytest.mark.parametrize("group", sorted(path.name for path in config_dir().iterdir() if path.is_dir()))
 def test_every_choice_of_every_group_has_a_help(group: str) -> None:
     for choice in choices(group):
@@ -145,6 +162,7 @@ def test_comments_belong_to_their_keys(tmp_path: Path) -> None:
         (("evaluate", "policy=zero", "serve.speed=3", "rows=[short]"), "speed"),
         (("evaluate", "policy=zero", "rows=[lob]"), "serve/lob does not exist (serve: long, mid_long"),
         (("evaluate", "policy=zero", "row=[short]"), "did you mean rows?"),
+        (("play", "a", "overrides=[ball=paper]"), "there is no key 'overrides'"),
         (("play", "a", "rows=[short]"), "there is no key 'rows'"),
         (("play", "a", "--video"), "--video needs a value"),
         (("export", "a", "ball=paper"), "ball= is of pace train, and changes nothing in pace export"),
