@@ -15,7 +15,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from pace.runs.metrics import MILESTONES, Curve, markdown, passage, passage_text, read_curve, write_slim
-from pace.studies.ablate import run_name
+from pace.studies.ablation import run_name
 
 HERE = Path(__file__).resolve().parent
 FOLDER, FIGURE = HERE / "recipe", HERE / "figures" / "recipe.png"

@@ -1,6 +1,6 @@
 """Play an exported policy in plain MuJoCo: the sim-to-sim test, and the starting point for a real robot.
 
-    python -m pace.deploy.export runs/my_run                  # writes policy.onnx
+    python -m pace.deploy runs/my_run out=.               # writes policy.onnx
     python examples/deploy_sim2sim.py policy.onnx         # 50 serves, prints what became of them
 
 Needs onnxruntime, mujoco and numpy, and nothing of PACE but the MJCF in pace/sim/assets. One core is enough.
@@ -473,7 +473,7 @@ def report(match: Match, seconds: float) -> str:
 def main() -> int:
     """Entry point; returns the exit status."""
     parser = argparse.ArgumentParser(description="Play an exported policy in plain MuJoCo.")
-    parser.add_argument("policy", type=Path, help="ONNX file of python -m pace.deploy.export")
+    parser.add_argument("policy", type=Path, help="ONNX file of python -m pace.deploy")
     parser.add_argument("--serves", type=int, default=50)
     parser.add_argument("--serve", choices=SERVES, default="mixed", help="serve range of the paper's evaluation")
     parser.add_argument("--noise", type=float, default=1.0, help="times the noise and delays of the training")

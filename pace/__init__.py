@@ -5,7 +5,10 @@
 
 from __future__ import annotations
 
+import sys
 from typing import TYPE_CHECKING, Any
+
+from pace.moved import MovedCommands
 
 if TYPE_CHECKING:
     from pace.rl.policies import load_policy
@@ -13,6 +16,7 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 __all__ = ["load_policy", "make_env"]
+sys.meta_path.append(MovedCommands())
 
 
 def __getattr__(name: str) -> Any:

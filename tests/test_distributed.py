@@ -288,11 +288,11 @@ def children_of(pid: int) -> list[int]:
 
 def test_two_processes_train_and_resume_exactly_and_one_goes_on_from_them(tmp_path: Path) -> None:
     whole, parts = tmp_path / "whole", tmp_path / "parts"
-    status, out, err = finish(start(f"run_dir={whole}", f"samples={3 * UPDATE}", *SMALL))
+    status, out, err = finish(start(f"out={whole}", f"samples={3 * UPDATE}", *SMALL))
     assert status == 0, err
     assert "8 worlds on cpu in 2 processes" in out
     assert f"3 updates, {3 * UPDATE} samples" in out
-    assert finish(start(f"run_dir={parts}", f"samples={2 * UPDATE}", *SMALL))[0] == 0
+    assert finish(start(f"out={parts}", f"samples={2 * UPDATE}", *SMALL))[0] == 0
     status, _, err = finish(start(f"resume={parts}", f"samples={3 * UPDATE}", "progress=false"))
     assert status == 0, err
     expected, resumed = load_checkpoint(whole), load_checkpoint(parts)
@@ -315,9 +315,9 @@ def test_two_processes_train_and_resume_exactly_and_one_goes_on_from_them(tmp_pa
 
 def test_the_jobs_of_a_sweep_have_helpers_of_their_own(tmp_path: Path) -> None:
     """Hydra's ``-m`` runs the command once for each value; a helper plays the task of its leader's job."""
-    run_dir = f"run_dir={tmp_path}/${{seed}}_${{sensing.name}}"
+    folder = f"out={tmp_path}/${{seed}}_${{sensing.name}}"
     status, _, err = finish(
-        start("-m", "sensing=clean,wide", f"hydra.sweep.dir={tmp_path}", run_dir, f"samples={UPDATE}", *SMALL)
+        start("-m", "sensing=clean,wide", f"hydra.sweep.dir={tmp_path}", folder, f"samples={UPDATE}", *SMALL)
     )
     assert status == 0, err
     delays = []
@@ -331,7 +331,7 @@ def test_the_jobs_of_a_sweep_have_helpers_of_their_own(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="looks for child processes in /proc")
 def test_ctrl_c_saves_and_a_lost_process_is_told(tmp_path: Path) -> None:
-    process = start(f"run_dir={tmp_path / 'stopped'}", "minutes=10", *SMALL)
+    process = start(f"out={tmp_path / 'stopped'}", "minutes=10", *SMALL)
     wait_for_rows(tmp_path / "stopped", process)
     children = children_of(process.pid)
     process.send_signal(signal.SIGINT)
@@ -343,14 +343,14 @@ def test_ctrl_c_saves_and_a_lost_process_is_told(tmp_path: Path) -> None:
     assert len(children) == 1
     assert not Path(f"/proc/{children[0]}").exists()
 
-    process = start(f"run_dir={tmp_path / 'lost'}", "minutes=10", *SMALL)
+    process = start(f"out={tmp_path / 'lost'}", "minutes=10", *SMALL)
     wait_for_rows(tmp_path / "lost", process)
     os.kill(children_of(process.pid)[0], signal.SIGKILL)
     status, _, err = finish(process)
     assert status == 1
     assert "error: process 1 of 2 ended with status -9" in err
 
-    process = start(f"run_dir={tmp_path / 'killed'}", "minutes=10", *SMALL)
+    process = start(f"out={tmp_path / 'killed'}", "minutes=10", *SMALL)
     wait_for_rows(tmp_path / "killed", process)
     (orphan,) = children_of(process.pid)
     process.kill()

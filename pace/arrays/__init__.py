@@ -1,6 +1,7 @@
 """Torch tensors and Warp arrays on one memory: structs of arrays, launches by name, random draws, graphs, state.
 
-Here belongs what every kernel needs, whatever it computes. Imports ``config`` and ``devices``."""
+Here belongs what every kernel needs, whatever it computes; not the kernels of one subject. Imports ``config`` and
+``devices``."""
 
 import warp as wp
 

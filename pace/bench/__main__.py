@@ -1,77 +1,24 @@
-"""``python -m pace.bench``: measure this machine. ``--help`` shows every key of the configuration.
-
-Examples::
-
-    python -m pace.bench                                     # all parts, some minutes
-    python -m pace.bench bench=quick num_worlds=64           # does it run?
-    python -m pace.bench bench.parts=[physics,update] bench.repeats=11
-
-Everything is measured in one run, what is compared by turns. Other overrides change what is measured, as they change
-training; keep the machine otherwise idle.
-"""
+"""``python -m pace.bench``: measure this machine; the same as ``pace bench``."""
 
 from __future__ import annotations
 
-import os
 import sys
-import time
-from pathlib import Path
-from typing import Any
 
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
-
-from pace.bench import physics, report, training, update
 from pace.command import run_command
-from pace.config.base import parse
-from pace.config.commands import BenchConfig
-from pace.devices import resolve_device
-from pace.runs.run_folder import default_run_dir, versions
-
-BUSY_LOAD = 0.5  # a core; a busier machine is worth a word
+from pace.command.run import Work
 
 
 def main() -> int:
     """Entry point; returns the exit status."""
-    return run_command(bench_from_config, "bench", (training.BenchError,))
+    return run_command("bench", load)
 
 
-def bench_from_config(composed: DictConfig) -> None:
-    """Measure as the composed configuration says; print the table, write the JSON, say where."""
-    config = parse(composed, BenchConfig)
-    overrides = [o for o in HydraConfig.get().overrides.task if not o.lstrip("+~").startswith("bench")]
-    path = Path(config.run_dir or default_run_dir(config.name)) / report.FILE
-    measure(config, overrides, path)
-    print(f"wrote {path}")
+def load() -> Work:
+    """What the command does, and the errors that it may end with."""
+    from pace.bench.measure import bench_from_config
+    from pace.bench.training import BenchError
 
-
-def measure(config: BenchConfig, overrides: list[str], path: Path) -> dict[str, Any]:
-    """Run the parts that ``config`` names, print the table and write it to ``path``; returns the figures by name.
-
-    ``overrides`` are those of ``config`` that concern training: the training loop runs as a command of its own.
-    """
-    device = resolve_device(config.device)
-    machine = report.machine(device)
-    if machine["load"] > BUSY_LOAD:
-        print(f"the machine is busy (load {machine['load']:.1f} on {os.cpu_count()} cores): figures will be low")
-    parts = {
-        "physics": lambda: physics.native_rates(config),
-        "mjwarp": lambda: physics.mjwarp_rates(config, device),
-        "update": lambda: update.update_rates(config, device),
-        "train": lambda: training.train_rates(config, overrides),
-        "memory": lambda: training.memory_peak(config, overrides),
-    }
-    measured: dict[str, float] = {}
-    for name in config.bench.parts:
-        print(f"measuring {name} ...", flush=True)
-        started = time.perf_counter()
-        measured |= parts[name]()
-        print(f"  {time.perf_counter() - started:.0f} s", flush=True)
-    figures = report.complete(measured)
-    settings = {"num_worlds": config.num_worlds, "physics_steps": config.substeps, "repeats": config.bench.repeats}
-    report.write(path, figures, {"settings": settings, "device": str(device), "machine": machine, **versions()})
-    print(report.table(figures))
-    return figures
+    return bench_from_config, (BenchError,)
 
 
 if __name__ == "__main__":

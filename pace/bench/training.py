@@ -48,7 +48,7 @@ def training_run(num_worlds: int, updates: int, overrides: list[str]) -> tuple[f
     Returns its control steps a second after the first updates (NaN for a run that is too short), and the largest
     resident memory of its processes together in MiB. Errors: :class:`BenchError` when the command fails.
     """
-    kept = without(overrides, "num_worlds", "samples", "minutes", "run_dir", "progress", "tensorboard")
+    kept = without(overrides, "num_worlds", "samples", "minutes", "out", "progress", "tensorboard")
     steps = load_train_config(kept).algo.steps
     with tempfile.TemporaryDirectory() as folder:
         settings = {
@@ -57,7 +57,7 @@ def training_run(num_worlds: int, updates: int, overrides: list[str]) -> tuple[f
             "minutes": 0,
             "progress": "false",
             "tensorboard": "false",
-            "run_dir": folder,
+            "out": folder,
         }
         command = [sys.executable, "-m", "pace.rl.train", *kept, *(f"{k}={v}" for k, v in settings.items())]
         memory = _peak_mib(command, Path(folder) / "output.txt")

@@ -7,12 +7,14 @@ here say which keys exist and of what type they are; an unknown key, a wrong typ
 
 from __future__ import annotations
 
-from dataclasses import is_dataclass
+from collections.abc import Iterable
+from dataclasses import fields, is_dataclass
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, TypeVar
 
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import ConfigKeyError, OmegaConfBaseException
 
 Range = list[float]
 T = TypeVar("T")
@@ -54,9 +56,21 @@ def parse(config: DictConfig | dict[str, Any], schema: type[T]) -> T:
         merged = OmegaConf.merge(OmegaConf.structured(schema), plain)
         return OmegaConf.to_object(merged)  # type: ignore[return-value]
     except OmegaConfBaseException as error:
-        key = getattr(error, "full_key", None) or "?"
-        reason = str(error).split("\n")[0]
-        raise ConfigError(f"configuration key '{key}': {reason}") from error
+        raise ConfigError(f"configuration key '{error.full_key or '?'}': {_reason(error)}") from error
+
+
+def _reason(error: OmegaConfBaseException) -> str:
+    """What is wrong with a key, in a line."""
+    text = str(error).split("\n")[0]
+    if isinstance(error, ConfigKeyError) and is_dataclass(error.object_type):
+        return text + meant(str(error.key), [field.name for field in fields(error.object_type)])
+    return "needs a list, such as [1.0, 2.0]" if "is not a ListConfig" in text else text
+
+
+def meant(word: str, known: Iterable[str]) -> str:
+    """``; did you mean ...?`` when ``word`` is close to one of ``known``, and else nothing."""
+    near = get_close_matches(word, list(known), 1)
+    return f"; did you mean {near[0]}?" if near else ""
 
 
 def compose(config_name: str, overrides: list[str] | None = None) -> DictConfig:

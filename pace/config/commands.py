@@ -1,4 +1,4 @@
-"""The other commands: bench, evaluate, export, play, ablate."""
+"""The other commands: bench, evaluate, export, play, ablate, keep, validate, studies."""
 
 from __future__ import annotations
 
@@ -101,10 +101,10 @@ class EvaluateConfig:
 
 @dataclass
 class ExportConfig:
-    """``python -m pace.deploy.export``: which policy, where to, and how it is checked."""
+    """``python -m pace.deploy``: which policy, where to, and how it is checked."""
 
     run: str | None
-    out: str
+    out: str | None  # folder; null: runs/<date>_export
     check_worlds: int
     check_steps: int
     tolerance: float  # rad, m, s
@@ -154,8 +154,7 @@ class AblateConfig:
     samples: float  # control steps of each run
     jobs: int  # runs at a time
     window: float  # control steps that a point of a curve averages over
-    run_dir: str
-    out: str | None  # null: run_dir
+    out: str  # folder of the runs, of a slim CSV each, and of the figure
     figure: str  # its name in out
     train: bool
     overrides: list[str]  # of the training
@@ -170,3 +169,41 @@ class AblateConfig:
             require(getattr(self, name) > 0, f"{name} must be positive, got {getattr(self, name)}")
         require(self.jobs >= 1, f"jobs must be at least 1, got {self.jobs}")
         require(self.figure.endswith(".png"), f"figure must end in .png, got {self.figure}")
+
+
+@dataclass
+class KeepConfig:
+    """``python -m pace.evaluation.keep``: which run becomes a published policy, and where."""
+
+    run: str | None
+    out: str | None
+    evaluation: str | None  # folder that pace evaluate wrote
+    notes: str | None  # Markdown file
+
+    def __post_init__(self) -> None:
+        require(self.run is not None, "which run? give its folder or a checkpoint, and the folder to write")
+        require(self.out is not None, "where to? give the folder of the policy, such as pretrained/mine")
+
+
+@dataclass
+class ValidateConfig:
+    """``python -m pace.studies.ball``: where its figures go."""
+
+    out: str | None
+
+
+@dataclass
+class StudiesConfig:
+    """``python -m pace.studies``: which measurements, of what, and how much of it."""
+
+    studies: list[str]  # names, or all
+    worlds: int
+    serves: int
+    run: str | None
+    cases: list[str]
+    predictors: list[str]
+    out: str | None
+
+    def __post_init__(self) -> None:
+        for name in ("worlds", "serves"):
+            require(getattr(self, name) >= 1, f"{name} must be at least 1, got {getattr(self, name)}")

@@ -11,6 +11,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from pace.config.base import ConfigError, compose, parse, to_dict
+from pace.config.names import check_choice, check_renamed
 from pace.config.training import TrainConfig
 
 #: Groups of configs/ that may be chosen anew for a saved policy; networks and observations may not.
@@ -49,6 +50,7 @@ def override_task(config: TrainConfig, overrides: Sequence[str]) -> TrainConfig:
 
     Errors: :class:`ConfigError` for anything else, and for keys and values that the configuration does not know.
     """
+    check_renamed(overrides)
     choices: dict[str, str] = {}
     values: list[str] = []
     for override in overrides:
@@ -76,6 +78,8 @@ def _choose(choices: Mapping[str, str]) -> dict[str, Any]:
     """The choice of each group, from configs/."""
     if not choices:
         return {}
+    for group, choice in choices.items():
+        check_choice(group, choice)
     try:
         fresh = compose("train", [f"{group}={choice}" for group, choice in choices.items()])
     except HydraException as error:

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field
 
 from pace.config.base import compose, parse, require
+from pace.config.names import check_renamed
 from pace.config.task import FRAME_DT, TaskConfig
 
 
@@ -95,7 +96,7 @@ class TrainConfig(TaskConfig):
     seed: int
     samples: float  # control steps in all; whichever of samples and minutes ends first
     minutes: float  # wall-clock; 0: no limit
-    run_dir: str | None  # null: runs/<date>_<name>
+    out: str | None  # folder of the run; null: runs/<date>_<name>
     resume: str | None  # a run folder or checkpoint to go on from
     init_from: str | None  # a run folder or checkpoint whose weights to start from
     checkpoint_minutes: float
@@ -124,7 +125,11 @@ class TrainConfig(TaskConfig):
 
 
 def load_train_config(overrides: list[str] | None = None) -> TrainConfig:
-    """The training configuration of ``configs/train.yaml`` with Hydra overrides such as ``["num_worlds=64"]``."""
+    """The training configuration of ``configs/train.yaml`` with Hydra overrides such as ``["num_worlds=64"]``.
+
+    Errors: :class:`ConfigError` for a bad value and for a name that is another one now.
+    """
+    check_renamed(overrides or [])
     return parse(compose("train", overrides), TrainConfig)
 
 

@@ -1,10 +1,4 @@
-"""``python -m pace.deploy.export RUN``: the policy as one ONNX file for the robot. ``--help`` shows every key.
-
-Examples::
-
-    python -m pace.deploy.export runs/2026-01-01_pace                     # writes policy.onnx
-    python -m pace.deploy.export pretrained/pace out=/tmp/robot.onnx
-    python examples/deploy_sim2sim.py policy.onnx                     # plays it in plain MuJoCo
+"""The policy as one ONNX file for the robot: written, described, and checked against torch.
 
 The file takes histories of raw sensor readings and gives joint targets: normaliser, predictor, forward kinematics and
 actor are in it (:mod:`pace.deploy.graph`). What the robot's own code needs besides lies in its metadata, as JSON. The
@@ -15,7 +9,6 @@ from __future__ import annotations
 
 import json
 import logging
-import sys
 import tempfile
 import warnings
 from collections.abc import Mapping
@@ -28,20 +21,19 @@ from numpy.typing import NDArray
 from omegaconf import DictConfig
 from torch import Tensor
 
-from pace.command import run_command
 from pace.config.base import parse, to_dict
 from pace.config.commands import ExportConfig
 from pace.config.overrides import ON_A_CPU
 from pace.config.training import TrainConfig
 from pace.deploy.graph import INPUTS, DeployedPolicy, input_ports, input_shapes, kept_outputs, output_ports
 from pace.rl.policies import TaskPolicy, load_policy
-from pace.runs.checkpoint import CheckpointError
-from pace.runs.run_folder import VERSIONS, git_state, versions
+from pace.runs.run_folder import VERSIONS, default_folder, git_state, versions
 from pace.sim.robot import build_model, joint_gains, motor_lines, nominal_pose
 from pace.sim.robot_spec import RobotSpec
 from pace.task.env import TableTennisEnv
 from pace.task.observations import POLICY, layout
 
+FILE = "policy.onnx"  # in the folder that the command writes
 FORMAT = 2  # of the metadata; 2: kept says which outputs the caller keeps
 ACTION_NOISE = 0.3  # standard deviation added to the actions while observations are recorded, so that they vary
 #: The check plays the task as saved, but for noise that is added to what the graph itself computes.
@@ -64,19 +56,15 @@ class ExportError(RuntimeError):
     """A policy that cannot be exported, or a file that does not compute what torch computes."""
 
 
-def main() -> int:
-    """Entry point; returns the exit status."""
-    return run_command(export_from_config, "export", (CheckpointError, ExportError), positional="run")
-
-
 def export_from_config(composed: DictConfig) -> None:
     """Export as the composed configuration says; print what was written and how well it agrees with torch."""
     config = parse(composed, ExportConfig)
     assert config.run is not None  # ExportConfig has seen to it
     policy = load_policy(config.run)
-    out = Path(config.out)
-    if out.is_dir():
-        raise ExportError(f"{out} is a folder: give the name of a file, such as out={out / 'policy.onnx'}")
+    folder = Path(config.out) if config.out else default_folder("export")
+    if folder.suffix == ".onnx":
+        raise ExportError(f"out={folder} must be a folder, in which policy.onnx is written")
+    out = folder / FILE
     differences = export_policy(policy, out, config)
     count = config.check_worlds * config.check_steps
     units = output_ports(policy.config)
@@ -313,7 +301,3 @@ def expected_outputs(env: TableTennisEnv, policy: TaskPolicy, action: Tensor) ->
     if actor.joints is not None:
         outputs["joints_next"] = actor.joints.state
     return outputs
-
-
-if __name__ == "__main__":
-    sys.exit(main())

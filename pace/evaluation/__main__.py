@@ -1,213 +1,25 @@
-"""``python -m pace.evaluation RUN``: the paper's table of hits and returns for a policy. ``--help`` shows every key.
-
-Examples::
-
-    python -m pace.evaluation runs/2026-01-01_pace                       # four serve ranges, 5,000 serves each
-    python -m pace.evaluation pretrained/pace serves=40000 ball=paper randomization=none
-    python -m pace.evaluation runs/2026-01-01_pace rows=[mixed] engine=mjwarp out=/tmp/mjwarp
-    python -m pace.evaluation policy=random serves=500 physics_dt=0.01   # what chance does
-    python -m pace.evaluation runs/2026-01-01_pace --sweep               # and what the policy survives
-    python -m pace.evaluation runs/2026-01-01_pace --sweep rows=[] out=FOLDER   # only that; goes on where it stopped
-
-RUN is a run folder, a checkpoint in one, or ``pretrained/<name>``. The task is rebuilt from what was saved with it.
-"""
+"""``python -m pace.evaluation RUN``: the paper's table of hits and returns; the same as ``pace evaluate``."""
 
 from __future__ import annotations
 
 import sys
-import time
-from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any
-
-from omegaconf import DictConfig
-from tqdm import tqdm
 
 from pace.command import run_command
-from pace.config.base import parse, to_dict
-from pace.config.commands import EvaluateConfig
-from pace.config.overrides import CHANGEABLE, override_task
-from pace.config.training import TrainConfig
-from pace.devices import resolve_device
-from pace.evaluation.figures import write_figures
-from pace.evaluation.report import describe, tables, write_report
-from pace.evaluation.serves import EvaluationError, Row, evaluate_row
-from pace.evaluation.sweep import (
-    Cell,
-    Tables,
-    Variation,
-    cells_to_play,
-    engine_name,
-    finished_cells,
-    plan_cell,
-    variations,
-    write_sweep,
-)
-from pace.rl.policies import TaskPolicy, built_in_policy, load_policy
-from pace.runs.checkpoint import CheckpointError
-from pace.runs.progress import SECONDS_PER_LINE, clock
-from pace.runs.run_folder import default_run_dir, versions
-
-TASK_PARTS = ("robot", "ball", "engine", "randomization", "sensing")  # what the report says of the task
+from pace.command.run import Work
 
 
 def main() -> int:
     """Entry point; returns the exit status."""
-    sys.argv[1:] = ["sweep=true" if argument == "--sweep" else argument for argument in sys.argv[1:]]
-    failures = (CheckpointError, EvaluationError)
-    return run_command(evaluate_from_config, "evaluate", failures, positional="run", task_groups=CHANGEABLE)
+    return run_command("evaluate", load)
 
 
-def evaluate_from_config(composed: DictConfig) -> None:
-    """Evaluate as the composed configuration says, and print what was measured and written."""
-    config = parse(composed, EvaluateConfig)
-    policy = choose_policy(config)
-    overrides = [f"engine.physics_dt={config.physics_dt}", *config.overrides]
-    context = circumstances(config, policy, overrides)
-    folder = Path(config.out) if config.out else default_run_dir("evaluation")
-    print(f"policy {policy.source}\n{describe(context)}", flush=True)
-    task = override_task(policy.config, overrides)
-    cells = [plan_cell(change, config, policy, overrides, context["versions"]) for change in changes(config, task)]
-    finished = finished_cells(folder, cells) if cells else {}
-    if config.rows:
-        evaluate_table(config, policy, task, overrides, folder, context)
-    if cells:
-        _announce(run_sweep(config, policy, cells, finished, folder, context))
+def load() -> Work:
+    """What the command does, and the errors that it may end with."""
+    from pace.evaluation.evaluate import evaluate_from_config
+    from pace.evaluation.serves import EvaluationError
+    from pace.runs.checkpoint import CheckpointError
 
-
-def changes(config: EvaluateConfig, task: TrainConfig) -> list[Variation]:
-    """What the sweep changes, if there is one."""
-    return variations(task, config.variations) if config.sweep else []
-
-
-def evaluate_table(
-    config: EvaluateConfig,
-    policy: TaskPolicy,
-    task: TrainConfig,
-    overrides: Sequence[str],
-    folder: Path,
-    context: Mapping[str, Any],
-) -> None:
-    """Play the rows that ``config`` names, print their table and write it with its figures into ``folder``."""
-    rows = [
-        _with_bar(config, policy, name, name, config.serves, config.num_worlds, config.device, overrides)
-        for name in config.rows
-    ]
-    folder.mkdir(parents=True, exist_ok=True)
-    print(f"\n{tables(rows, config.paper)}\n")
-    target = task.reward.terms["predicted_landing"].params
-    files = write_report(folder, rows, config.paper, context)
-    _announce([*files, *write_figures(folder, rows, task.ball.table, (target["x"], target["y"]))])
-
-
-def choose_policy(config: EvaluateConfig) -> TaskPolicy:
-    """The policy that ``config`` names: a saved one, or a built-in on the saved or the default task."""
-    saved = load_policy(config.run) if config.run else None
-    if config.policy == "run":
-        assert saved is not None  # EvaluateConfig has seen to it
-        return saved
-    return built_in_policy(config.policy, config.seed, saved, config.device)
-
-
-def circumstances(config: EvaluateConfig, policy: TaskPolicy, overrides: Sequence[str]) -> dict[str, Any]:
-    """What the figures depend on, for the report.
-
-    Errors: :class:`pace.config.ConfigError` for an unknown serve range and a physics step that does not divide the
-    control step, so that they come before hours of play.
-    """
-    for name in (*config.rows, *(config.sweep_rows if config.sweep else ())):
-        override_task(policy.config, [f"serve={name}"])
-    task = override_task(policy.config, overrides)
-    device = resolve_device(config.device)
-    return {
-        "policy": policy.source,
-        "counters": dict(policy.counters),
-        "ball": task.ball.name,
-        "engine": engine_name(task, device.type),
-        "device": str(device),
-        "physics_dt": task.robot.control_dt / task.substeps,
-        "randomization": task.randomization.name,
-        "sensing": task.sensing.name,
-        "seed": config.seed,
-        "num_worlds": config.num_worlds,
-        "warmup_serves": config.warmup_serves,
-        "overrides": list(overrides),
-        "versions": versions(),
-        "task": {name: value for name, value in to_dict(task).items() if name in TASK_PARTS},
-    }
-
-
-def run_sweep(
-    config: EvaluateConfig,
-    policy: TaskPolicy,
-    cells: Sequence[Cell],
-    finished: Tables,
-    folder: Path,
-    context: Mapping[str, Any],
-) -> list[Path]:
-    """Play those ``cells`` that are not ``finished``; the files in ``folder`` are up to date after each.
-
-    A change that changes nothing is not played again. Returns the files.
-    """
-    open_cells = cells_to_play(cells, finished)
-    print(f"\nsweep: {len(cells)} cells, {len(open_cells)} to play; finished ones go to {folder}", flush=True)
-    total, done, started = sum(cell.cost for cell in open_cells), 0.0, time.monotonic()
-    files = write_sweep(folder, cells, finished, context) if not open_cells else []
-    for number, cell in enumerate(open_cells, 1):
-        try:
-            finished[cell.key] = play_cell(config, policy, cell)
-            files = write_sweep(folder, cells, finished, context)
-        except KeyboardInterrupt:
-            print(f"\nto go on: the same command with rows=[] out={folder}", file=sys.stderr)
-            raise
-        done += cell.cost
-        left = clock((time.monotonic() - started) * (total - done) / done)
-        print(f"{number}/{len(open_cells)} | {left} left | {cell_text(cell, finished[cell.key])}", flush=True)
-    return files
-
-
-def play_cell(config: EvaluateConfig, policy: TaskPolicy, cell: Cell) -> list[dict[str, Any]]:
-    """Summaries of the rows of a cell."""
-    label = cell.variation.label
-    return [
-        _with_bar(
-            config, policy, name, f"{label}, {name}", cell.serves, cell.worlds, cell.device, cell.overrides
-        ).summary
-        for name in config.sweep_rows
-    ]
-
-
-def cell_text(cell: Cell, rows: Sequence[Mapping[str, Any]]) -> str:
-    """A finished cell in a line."""
-    shares = (f"{row['serve']} {100 * row['hit']:.0f}/{100 * row['success']:.0f}" for row in rows)
-    return f"{cell.variation.label}: hit/success % {', '.join(shares)} ({rows[0]['serves']:,} serves a row)"
-
-
-def _with_bar(
-    config: EvaluateConfig,
-    policy: TaskPolicy,
-    serve: str,
-    label: str,
-    serves: int,
-    num_worlds: int,
-    device: str,
-    overrides: Sequence[str],
-) -> Row:
-    """One row, with a progress bar of its serves."""
-    interval = 0.2 if sys.stderr.isatty() else SECONDS_PER_LINE
-    look = {"desc": f"{label:<10}", "unit": "serve", "disable": not config.progress, "mininterval": interval}
-    with tqdm(total=serves, **look) as bar:
-
-        def show(counted: int) -> None:
-            bar.update(min(counted, serves) - bar.n)
-
-        worlds = min(num_worlds, serves)
-        return evaluate_row(policy, serve, serves, worlds, device, config.seed, overrides, config.warmup_serves, show)
-
-
-def _announce(files: Sequence[Path]) -> None:
-    for file in files:
-        print(f"wrote {file}")
+    return evaluate_from_config, (EvaluationError, CheckpointError)
 
 
 if __name__ == "__main__":

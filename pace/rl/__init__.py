@@ -1,6 +1,6 @@
 """How a policy learns: networks, rollouts, PPO, the training loop, and loading what was trained.
 
-Here belongs the learner; the task it learns is in ``task``, how well it plays is measured in ``evaluation``. Imports
+Here belongs the learner; not the task that it learns (``task``), nor how well it plays (``evaluation``). Imports
 ``task``, ``predictor``, ``runs`` and the rooms below. ``python -m pace.rl.train`` trains.
 """
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from pace.arrays.state import under_prefix
-from pace.config.base import ConfigError, config_dir, parse
+from pace.config.base import ConfigError, config_dir, meant, parse
 from pace.config.overrides import override_task, stage_tasks
 from pace.config.task import PredictorConfig
 from pace.config.training import TrainConfig
@@ -23,6 +23,7 @@ from pace.task.observations import JOINTS, POLICY
 
 if TYPE_CHECKING:
     from pace.task.env import TableTennisEnv
+PRETRAINED = "pretrained"  # folder of published policies, beside configs/
 RANDOM_STD = 0.8  # of the random policy's actions: how widely a training run begins to explore
 
 
@@ -113,11 +114,15 @@ def load_predictor(path: str | Path) -> TrainedPredictor:
 def locate(path: str | Path) -> Path:
     """``path``, or the one of that name beside the package's ``configs/`` (so that ``pretrained/<name>`` is found).
 
-    Errors: :class:`CheckpointError` for a file that is no part of a checkpoint.
+    Errors: :class:`CheckpointError` for a file that is no part of a checkpoint, and for a ``pretrained/<name>`` that is
+    not there, with those that are.
     """
     path = Path(path)
     if not path.exists() and not path.is_absolute() and (config_dir().parent / path).exists():
         path = config_dir().parent / path
+    if not path.exists() and path.parent.name == PRETRAINED:
+        known = sorted(file.parent.name for file in (config_dir().parent / PRETRAINED).glob(f"*/{META}"))
+        raise CheckpointError(f"{path} does not exist{meant(path.name, known)} ({PRETRAINED}: {', '.join(known)})")
     if path.is_file() and path.name not in (META, WEIGHTS, TRAINING):
         raise CheckpointError(f"{path} is no file of a checkpoint: give a run folder, or a folder with {META}")
     return path

@@ -1,181 +1,26 @@
-"""``python -m pace.rl.train``: train a policy and its predictor. ``--help`` shows every key of the configuration.
-
-Examples::
-
-    python -m pace.rl.train                                  # the recipe for CPU cores, half an hour
-    python -m pace.rl.train experiment=paper device=cuda     # the paper's numbers
-    torchrun --nproc-per-node=8 -m pace.rl.train device=cuda num_worlds=32768    # eight GPUs, or several machines
-    python -m pace.rl.train resume=runs/2026-01-01_pace minutes=60
-    python -m pace.rl.train init_from=runs/2026-01-01_pace ball=paper
-    python -m pace.rl.train init_from=runs/2026-01-01_pace predictor=filter predictor_from=runs/2026-01-01_predictor
-"""
+"""``python -m pace.rl.train``: train a policy and its predictor; the same as ``pace train``."""
 
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
-from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING
-
-import torch
-from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
 
 from pace.command import run_command
-from pace.config.base import ConfigError, parse, to_dict
-from pace.config.training import RESUME_KEYS, TrainConfig
-from pace.devices import resolve_device, threads_of
-from pace.distributed import Team, TeamError, own_device, suitable_size, team_of
-from pace.predictor.network import PredictorNetwork
-from pace.rl.curriculum import Curriculum
-from pace.rl.rollout import RolloutError
-from pace.rl.trainer import Summary, Trainer, begins_anew, played_on
-from pace.runs.checkpoint import Checkpoint, CheckpointError, load_checkpoint
-from pace.runs.progress import rate_texts
-from pace.runs.run_folder import CURVE, METRICS, RunFolder, default_run_dir
-
-if TYPE_CHECKING:
-    from pace.task.env import TableTennisEnv
-SEEDS_APART = 1_000_003  # between the stages of a curriculum: further than seeds of runs lie apart
+from pace.command.run import Work
 
 
 def main() -> int:
     """Entry point; returns the exit status."""
-    return run_command(train_from_config, "train", (CheckpointError, RolloutError, TeamError))
+    return run_command("train", load)
 
 
-def train_from_config(composed: DictConfig) -> None:
-    """Train as the composed configuration says, and print what was written."""
-    config = parse(composed, TrainConfig)
-    hydra = HydraConfig.get()
-    overrides = list(hydra.overrides.task)
-    if config.resume:
-        saved = load_checkpoint(config.resume)
-        config = resumed_config(saved, config.resume, overrides)
-    else:
-        saved = None
-    device = resolve_device(own_device(config.device))
-    if saved and device.type != played_on(saved) and not any(key.startswith("processes=") for key in overrides):
-        config.processes = 0  # as many as suit this kind of device
-    config.processes = config.processes or suitable_size(config.num_worlds, device)
-    arguments = overrides if hydra.mode == RunMode.MULTIRUN else None  # of this job; the command's are of all
-    with team_of(config.processes, device, arguments) as team:
-        trainer = build_trainer(config, saved, device, team)
-        if trainer.run is not None:
-            announce(trainer, trainer.run, saved)
-        summary = trainer.train()
-    if summary is not None:
-        report(summary)
+def load() -> Work:
+    """What the command does, and the errors that it may end with."""
+    from pace.distributed import TeamError
+    from pace.rl.rollout import RolloutError
+    from pace.rl.session import train_from_config
+    from pace.runs.checkpoint import CheckpointError
 
-
-def resumed_config(saved: Checkpoint, path: str, overrides: list[str]) -> TrainConfig:
-    """The saved configuration with the limits of the command line.
-
-    Errors: :class:`ConfigError` for an override of anything that a resumed run may not change.
-    """
-    for override in overrides:
-        key = override.split("=")[0].lstrip("+~")
-        if key not in RESUME_KEYS:
-            raise ConfigError(f"'{key}' cannot change in a resumed run ({', '.join(RESUME_KEYS)} can): use init_from")
-    changed = OmegaConf.merge(OmegaConf.create(saved.config), OmegaConf.from_dotlist(overrides))
-    config = parse(OmegaConf.to_container(changed), TrainConfig)  # type: ignore[arg-type]
-    config.resume, config.init_from, config.predictor_from = path, None, None
-    if saved.counters["samples"] >= config.samples:
-        raise ConfigError(f"{path} has {saved.counters['samples']} samples: give samples= above that to go on")
-    if saved.path is not None:  # where the run lies now; it may have been moved or copied since it was saved
-        config.run_dir = str(saved.path.parent.parent)
-    return config
-
-
-def build_trainer(config: TrainConfig, saved: Checkpoint | None, device: torch.device, team: Team) -> Trainer:
-    """Networks, this process's worlds and the leader's run folder; state from ``saved`` or :func:`first_weights`.
-
-    Errors: :class:`ConfigError` for worlds that the team cannot share equally.
-    """
-    if config.num_worlds % team.size:
-        raise ConfigError(f"num_worlds {config.num_worlds} cannot be shared equally by {team.size} processes")
-    start = first_weights(config)
-    torch.manual_seed(config.seed)
-    predictor = PredictorNetwork(config.predictor).to(device)
-    anew = saved is not None and begins_anew(saved, team, device)
-    again = int(saved.counters["updates"]) if saved and anew else 0  # or the run's beginning would be drawn once more
-    make = partial(make_worlds, device=device, team=team, predictor=predictor, again=again)
-    curriculum = Curriculum(config, make, saved.counters["samples"] if saved else 0.0)
-    run = open_run(config, int(saved.counters["updates"]) if saved else 0) if team.leads else None
-    trainer = Trainer(config, curriculum.worlds, predictor, run, team, curriculum)
-    torch.manual_seed(team.seed(config.seed + again))  # the networks began alike, what is played does not
-    if saved:
-        trainer.resume(saved)
-    elif start:
-        trainer.start_from(start)
-    return trainer
-
-
-def make_worlds(
-    task: TrainConfig, stage: int, device: torch.device, team: Team, predictor: PredictorNetwork, again: int = 0
-) -> TableTennisEnv:
-    """This process's worlds of one stage of the curriculum; each stage draws from random numbers of its own.
-
-    ``again``: another number makes other draws, for worlds that begin anew in a run.
-    """
-    from pace.task.env import TableTennisEnv
-
-    threads = task.engine.threads or threads_of(team.size)
-    task = replace(task, engine=replace(task.engine, threads=threads))
-    seed = team.seed(task.seed + SEEDS_APART * stage + again)
-    return TableTennisEnv(task, task.num_worlds // team.size, device, seed, predictor)
-
-
-def first_weights(config: TrainConfig) -> Checkpoint | None:
-    """What a new run starts from: ``config.init_from`` with the predictor of ``config.predictor_from``, or one of them.
-
-    Errors: :class:`CheckpointError` for one that cannot be read.
-    """
-    start = load_checkpoint(config.init_from, weights_only=True) if config.init_from else None
-    if not config.predictor_from:
-        return start
-    given = load_checkpoint(config.predictor_from, weights_only=True)
-    if "predictor" not in given.weights:
-        raise CheckpointError(f"{given.path} has no predictor: give predictor_from a run of pace.predictor.__main__")
-    if start is None:
-        return replace(given, weights={"predictor": given.weights["predictor"]})
-    return replace(start, weights=start.weights | {"predictor": given.weights["predictor"]})
-
-
-def open_run(config: TrainConfig, first_update: int) -> RunFolder:
-    """The run folder that ``config`` names, or a new one, whose path ``config`` then holds."""
-    config.run_dir = config.run_dir or str(default_run_dir(config.name))
-    return RunFolder(Path(config.run_dir), to_dict(config), config.tensorboard, first_update)
-
-
-def announce(trainer: Trainer, run: RunFolder, saved: Checkpoint | None) -> None:
-    """Print what is about to be trained, on what, from what, and where it is kept."""
-    if saved is not None:
-        anew = ", with worlds that begin anew" if begins_anew(saved, trainer.team, trainer.device) else ""
-        print(f"going on from {saved.path}{anew}")
-    shared = f" in {trainer.team.size} processes" if trainer.team.size > 1 else ""
-    agent = trainer.agent
-    number_format = str(agent.observation_dtype).removeprefix("torch.")
-    if agent.observation_dtype != torch.float32 and agent.fp32_below > 0.0:
-        number_format += f" (float32 below a std of {agent.fp32_below:g})"
-    print(
-        f"training {trainer.config.name}: {trainer.config.num_worlds} worlds on {trainer.device}{shared}, "
-        f"networks in {number_format}, run folder {run.path}",
-        flush=True,
-    )
-
-
-def report(summary: Summary) -> None:
-    """Print how the run ended and which files it wrote."""
-    run_dir = summary.checkpoint.parent.parent
-    print(
-        f"{summary.reason}: {summary.updates} updates, {summary.samples:,} samples, {summary.seconds / 60:.1f} min\n"
-        f"last updates: {', '.join(rate_texts(summary.rates))}\n"
-        f"wrote {summary.checkpoint}\n"
-        f"wrote {run_dir / METRICS}" + (f"\nwrote {run_dir / CURVE}" if summary.curve else "")
-    )
+    return train_from_config, (TeamError, RolloutError, CheckpointError)
 
 
 if __name__ == "__main__":

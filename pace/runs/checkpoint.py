@@ -20,7 +20,8 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-FORMAT = 1
+from pace.config.upgrade import FORMAT, upgrade_config, upgrade_state
+
 META, WEIGHTS, TRAINING = "checkpoint.json", "weights.safetensors", "training.safetensors"
 FOLDER = "checkpoints"
 TENSOR_MARK = "__tensor__"
@@ -125,9 +126,9 @@ def find_checkpoint(path: str | Path) -> Path:
     raise CheckpointError(f"{path} is neither a run folder nor a checkpoint: it has no {FOLDER}/ and no {META}")
 
 
-def list_checkpoints(run_dir: Path) -> list[Path]:
+def list_checkpoints(run: Path) -> list[Path]:
     """Complete checkpoints of a run, oldest first."""
-    return sorted(folder for folder in (run_dir / FOLDER).glob("update_*") if (folder / META).is_file())
+    return sorted(folder for folder in (run / FOLDER).glob("update_*") if (folder / META).is_file())
 
 
 def load_checkpoint(path: str | Path, weights_only: bool = False) -> Checkpoint:
@@ -141,11 +142,14 @@ def load_checkpoint(path: str | Path, weights_only: bool = False) -> Checkpoint:
     training = None
     if meta["training"] is not None and not weights_only:
         training = restore_tensors(meta["training"], _read_tensors(folder / TRAINING), folder / TRAINING)
+        training = upgrade_state(training, meta["format"])
     return Checkpoint(meta["config"], meta["counters"], weights, training, folder)
 
 
 def read_meta(folder: Path) -> dict[str, Any]:
     """What ``checkpoint.json`` of a checkpoint holds: config, counters and places of the tensors, which stay unread.
+
+    The configuration is that of the current format, ``format`` that of the file.
 
     Errors: :class:`CheckpointError` for a file that cannot be read, has another format number or lacks a part.
     """
@@ -156,12 +160,12 @@ def read_meta(folder: Path) -> dict[str, Any]:
         raise CheckpointError(f"{file} cannot be read: {error}") from error
     if not isinstance(meta, dict) or "format" not in meta:
         raise CheckpointError(f"{file} is not a checkpoint: it has no format number")
-    if meta["format"] != FORMAT:
-        raise CheckpointError(f"{file} has format {meta['format']}, this version of pace reads format {FORMAT}")
+    if meta["format"] not in range(1, FORMAT + 1):
+        raise CheckpointError(f"{file} has format {meta['format']}, this version of pace reads format 1 to {FORMAT}")
     missing = [key for key in ("config", "counters", "weights", "training") if key not in meta]
     if missing:
         raise CheckpointError(f"{file} lacks {', '.join(missing)}")
-    return meta
+    return meta | {"config": upgrade_config(meta["config"], meta["format"])}
 
 
 def _read_tensors(file: Path) -> dict[str, Tensor]:
@@ -191,15 +195,15 @@ def load_weights(module: nn.Module, weights: Mapping[str, Tensor], source: str) 
     module.load_state_dict(dict(weights))
 
 
-def prune_checkpoints(run_dir: Path, keep: int) -> None:
+def prune_checkpoints(run: Path, keep: int) -> None:
     """Delete all but the newest ``keep`` checkpoints of a run."""
-    for folder in list_checkpoints(run_dir)[:-keep]:
+    for folder in list_checkpoints(run)[:-keep]:
         shutil.rmtree(folder)
 
 
 #: Keys that say where and how a run was made, not what it learned: a kept policy has their defaults.
 RUN_KEYS: dict[str, Any] = {
-    "device": "auto", "processes": 0, "run_dir": None, "resume": None, "init_from": None, "predictor_from": None
+    "device": "auto", "processes": 0, "out": None, "resume": None, "init_from": None, "predictor_from": None
 }  # fmt: skip
 
 

@@ -30,7 +30,7 @@ TRAIN = (sys.executable, "-m", "pace.rl.train")
 POLL_SECONDS = 0.5
 TAIL_BYTES = 8192  # of a metrics.csv: more than its last row
 #: What may differ between the runs that are there and those that are asked for.
-FREE_KEYS = (*RESUME_KEYS, "init_from", "predictor_from", "run_dir")
+FREE_KEYS = (*RESUME_KEYS, "init_from", "predictor_from", "out")
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Run:
         limits = [f"samples={self.samples}", "minutes=0", "progress=false"]
         if list_checkpoints(self.folder):
             return [f"resume={quote(str(self.folder))}", *limits]
-        return [*self.overrides, f"run_dir={quote(str(self.folder))}", *limits]
+        return [*self.overrides, f"out={quote(str(self.folder))}", *limits]
 
 
 def check_settings(run: Run) -> None:
@@ -82,7 +82,7 @@ def check_settings(run: Run) -> None:
     for key in sorted(set(asked) | set(there)):
         if key.split(".")[0] not in FREE_KEYS and asked.get(key) != there.get(key):
             what = f"{key} {there.get(key)}, and {asked.get(key)} is asked for"
-            raise ConfigError(f"{run.folder} was trained with {what}: give another run_dir")
+            raise ConfigError(f"{run.folder} was trained with {what}: give another out=")
 
 
 def _flat(tree: dict, prefix: str = "") -> dict:

@@ -18,6 +18,7 @@ from omegaconf import OmegaConf
 from torchrl.record.loggers.tensorboard import TensorboardLogger
 
 from pace.config.base import ConfigError
+from pace.config.upgrade import FORMAT
 from pace.runs.checkpoint import list_checkpoints
 from pace.runs.metrics import read_metrics
 
@@ -31,7 +32,7 @@ LEADING = (
 CURVE_WINDOW = 40  # rows of the moving average in the plot
 
 
-def default_run_dir(name: str) -> Path:
+def default_folder(name: str) -> Path:
     """``runs/<date>_<name>``, with a number where that is taken."""
     base = Path("runs") / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}_{name}"
     candidate, number = base, 2
@@ -84,7 +85,7 @@ class RunFolder:
     def __init__(self, path: str | Path, config: dict[str, Any], tensorboard: bool, first_update: int = 0) -> None:
         self.path = Path(path)
         self._claim(first_update)
-        (self.path / CONFIG).write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
+        (self.path / CONFIG).write_text(f"# format: {FORMAT}\n{OmegaConf.to_yaml(OmegaConf.create(config))}")
         (self.path / VERSIONS).write_text(json.dumps(versions(), indent=1))
         self._columns: list[str] = []
         self._file = self._open_metrics(first_update)
@@ -95,19 +96,19 @@ class RunFolder:
         try:
             self.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise ConfigError(f"run_dir {self.path} cannot be made: {error.strerror}") from error
+            raise ConfigError(f"out={self.path} cannot be made: {error.strerror}") from error
         self._lock = FileLock(self.path / LOCK)  # the system lets go of it with the process, however that ends
         try:
             self._lock.acquire(timeout=0)
         except Timeout as error:
             raise ConfigError(
-                f"{self.path} is in use by another process: end that first, or give another run_dir"
+                f"{self.path} is in use by another process: end that first, or give another out="
             ) from error
         last = max((int(folder.name.removeprefix("update_")) for folder in list_checkpoints(self.path)), default=0)
         if last > first_update:
             raise ConfigError(
                 f"{self.path} has a checkpoint of update {last}: resume={self.path} goes on from it; "
-                "or give another run_dir, or move it away"
+                "or give another out=, or move it away"
             )
 
     @property
@@ -165,11 +166,11 @@ def moving_average(values: list[float], window: int) -> list[float]:
     return result
 
 
-def plot_learning_curve(run_dir: str | Path) -> Path | None:
+def plot_learning_curve(run: str | Path) -> Path | None:
     """Draw ``learning_curve.png`` from the run's CSV; None when it has fewer than two rows."""
     from matplotlib.figure import Figure  # imported here: it takes a second that no training should wait for
 
-    metrics = read_metrics(Path(run_dir) / METRICS)
+    metrics = read_metrics(Path(run) / METRICS)
     if len(metrics.get("update", [])) < 2:
         return None
     millions = [samples / 1e6 for samples in metrics["samples"]]
@@ -191,6 +192,6 @@ def plot_learning_curve(run_dir: str | Path) -> Path | None:
         axes.grid(alpha=0.3)
         axes.legend(loc="best")
     axes.set_xlabel(f"control steps, millions (mean of {CURVE_WINDOW} updates)")
-    file = Path(run_dir) / CURVE
+    file = Path(run) / CURVE
     figure.savefig(file, dpi=110)
     return file

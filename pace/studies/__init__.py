@@ -1,1 +1,5 @@
-"""Studies of the simulation for ``docs/engines.md`` and ``docs/physics.md``: engines, step sizes, paddle reaction."""
+"""Measurements for the documentation: engines, motors, predictions, ablations, the validation of the ball.
+
+Here belongs what answers a question once and is repeated when the code changes; nothing that training or play needs.
+May import every room. ``python -m pace.studies`` lists and runs them.
+"""

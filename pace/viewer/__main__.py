@@ -1,90 +1,26 @@
-"""``python -m pace.viewer RUN``: watch a policy play, on a live page or in a film. ``--help`` shows every key.
-
-Examples::
-
-    python -m pace.viewer runs/2026-01-01_pace                       # a page on http://127.0.0.1:8080
-    python -m pace.viewer pretrained/pace ball=paper serve=short port=9000
-    python -m pace.viewer runs/2026-01-01_pace --video out.mp4 seconds=30 speed=0.25
-
-RUN is a run folder, a checkpoint in one, or ``pretrained/<name>``. The task is rebuilt from what was saved with it.
-"""
+"""``python -m pace.viewer RUN``: watch a policy, on a live page or in a film; the same as ``pace play``."""
 
 from __future__ import annotations
 
 import sys
-from pathlib import Path
-
-from omegaconf import DictConfig
-from tqdm import tqdm
 
 from pace.command import run_command
-from pace.config.base import parse
-from pace.config.commands import PlayConfig
-from pace.config.overrides import CHANGEABLE
-from pace.evaluation.sweep import ball_presets
-from pace.rl.policies import TaskPolicy, load_policy
-from pace.runs.checkpoint import CheckpointError
-from pace.runs.progress import SECONDS_PER_LINE
-from pace.sim.render import RenderError
-from pace.viewer.playback import Show
-from pace.viewer.video import write_video
-from pace.viewer.web import Page, PageError
+from pace.command.run import Work
 
 
 def main() -> int:
     """Entry point; returns the exit status."""
-    sys.argv[1:] = video_option(sys.argv[1:])
-    failures = (CheckpointError, PageError, RenderError)
-    return run_command(play_from_config, "play", failures, positional="run", task_groups=CHANGEABLE)
+    return run_command("play", load)
 
 
-def video_option(arguments: list[str]) -> list[str]:
-    """``--video out.mp4`` and ``--video=out.mp4`` as ``video=out.mp4``."""
-    result: list[str] = []
-    for argument in arguments:
-        if result and result[-1] == "--video":
-            result[-1] = f"video={argument}"
-        else:
-            result.append(argument.removeprefix("--") if argument.startswith("--video=") else argument)
-    return result
+def load() -> Work:
+    """What the command does, and the errors that it may end with."""
+    from pace.runs.checkpoint import CheckpointError
+    from pace.sim.render import RenderError
+    from pace.viewer.play import play_from_config
+    from pace.viewer.web import PageError
 
-
-def play_from_config(composed: DictConfig) -> None:
-    """Play as the composed configuration says, and print where to look."""
-    config = parse(composed, PlayConfig)
-    assert config.run is not None  # PlayConfig has seen to it
-    policy = load_policy(config.run)
-    overrides = [f"engine.physics_dt={config.physics_dt}", *config.overrides]
-    if config.video:
-        film(config, policy, overrides)
-    else:
-        page(config, policy, overrides)
-
-
-def page(config: PlayConfig, policy: TaskPolicy, overrides: list[str]) -> None:
-    """Show the page until Ctrl-C."""
-    shown = Page(policy, overrides, ball_presets(), config.host, config.port, config.speed, config.seed)
-    print(f"policy {policy.source}\nopen {shown.url} in a browser; Ctrl-C ends it", flush=True)
-    try:
-        shown.run()
-    except KeyboardInterrupt:
-        print("\nended")
-
-
-def film(config: PlayConfig, policy: TaskPolicy, overrides: list[str]) -> None:
-    """Write the film."""
-    assert config.video
-    file, show = Path(config.video), Show(policy, overrides, config.seed)
-    total = round(config.seconds * config.fps / config.speed)
-    size = (config.width, config.height)
-    interval = 0.2 if sys.stderr.isatty() else SECONDS_PER_LINE
-    with tqdm(total=total, desc=file.name, unit="picture", mininterval=interval) as bar:
-        write_video(file, show, config.seconds, config.fps, config.speed, *size, on_picture=lambda: _tick(bar))
-    print(f"policy {policy.source}\n{show.score.text()}\nwrote {file}")
-
-
-def _tick(bar: tqdm) -> None:
-    bar.update()
+    return play_from_config, (CheckpointError, RenderError, PageError)
 
 
 if __name__ == "__main__":

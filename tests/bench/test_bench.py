@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from pace.bench import physics, report, training
-from pace.bench.__main__ import measure
 from pace.bench.environment import EnvironmentCrew
+from pace.bench.measure import measure
 from pace.bench.physics import RawMujoco
 from pace.bench.timing import median_seconds
 from pace.bench.training import BenchError

@@ -21,6 +21,7 @@ from pace.config.base import ConfigError, compose, parse
 from pace.config.commands import ExportConfig
 from pace.config.training import TrainConfig, load_train_config
 from pace.deploy import export
+from pace.deploy.__main__ import main
 from pace.deploy.export import ExportError, RawReadings, compare, export_policy, open_session, training_versions
 from pace.deploy.graph import (
     INPUTS,
@@ -253,11 +254,11 @@ def test_bad_input_is_one_line(
     for arguments, status, message in (
         ([], 2, "which run?"),
         (["/nowhere"], 1, "does not exist"),
-        ([str(run), f"out={tmp_path}"], 1, "is a folder"),
+        ([str(run), f"out={tmp_path / 'policy.onnx'}"], 1, "must be a folder"),
         ([str(run), "speed=1"], 2, "speed"),
     ):
         monkeypatch.setattr("sys.argv", ["export", *arguments])
-        assert export.main() == status
+        assert main() == status
         error = capsys.readouterr().err.strip()
         assert error.startswith("error: ")
         assert message in error

@@ -11,12 +11,12 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from pace.command import collect_overrides, name_argument
+from pace.command.arguments import collect_overrides, name_argument
 from pace.config.base import compose, parse
 from pace.config.commands import EvaluateConfig
 from pace.config.overrides import override_task
-from pace.evaluation import __main__ as evaluate
-from pace.evaluation import sweep
+from pace.evaluation import evaluate, sweep
+from pace.evaluation.__main__ import main
 from pace.evaluation.report import clean, text_table
 from pace.evaluation.serves import COLUMNS, C, ServeRecorder, count_failures, evaluate_row, summarise, wilson
 from pace.evaluation.sweep import Variation, ball_presets, plan_cell, variations
@@ -184,7 +184,7 @@ def test_a_saved_policy_reports_its_predictor(tmp_path: Path) -> None:
 
 def run_main(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     monkeypatch.setattr("sys.argv", ["evaluate", *arguments])
-    return evaluate.main()
+    return main()
 
 
 def test_the_command_writes_what_it_says(

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
 import torch
 
-from pace.evaluation.keep import keep, main
+from pace.evaluation import publish
+from pace.evaluation.keep import main
+from pace.evaluation.publish import KeepError, keep
 from pace.rl.policies import load_policy
 from tests.helpers.saved import save_run
 
@@ -20,7 +23,14 @@ EVALUATED = {
 }  # fmt: skip
 
 
-def test_the_kept_policy_acts_like_the_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def run_main(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    monkeypatch.setattr("sys.argv", ["keep", *arguments])
+    return main()
+
+
+def test_the_kept_policy_acts_like_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     run = save_run(tmp_path / "run")
     (run / "metrics.csv").write_text("update,samples\n3,99\n")
     evaluation = tmp_path / "evaluation"
@@ -30,7 +40,7 @@ def test_the_kept_policy_acts_like_the_run(tmp_path: Path, capsys: pytest.Captur
     (tmp_path / "notes.md").write_text("Made by a test.\n")
     kept = tmp_path / "pretrained" / "mine"
     extra = ["--evaluation", str(evaluation), "--notes", str(tmp_path / "notes.md")]
-    assert main([str(run), str(kept), *extra]) == 0
+    assert run_main(monkeypatch, str(run), str(kept), *extra) == 0
     assert "metrics.csv" in capsys.readouterr().out
     names = {file.name for file in kept.iterdir()}
     files = {"checkpoint.json", "weights.safetensors", "metrics.csv", "evaluation.json", "sweep.json", "README.md"}
@@ -38,7 +48,7 @@ def test_the_kept_policy_acts_like_the_run(tmp_path: Path, capsys: pytest.Captur
     before, after = load_policy(run), load_policy(kept)
     observation = torch.randn(5, 450)
     torch.testing.assert_close(after(observation), before(observation), atol=1e-6, rtol=0)
-    assert (after.config.engine.name, after.config.engine.threads, after.config.run_dir) == ("auto", 0, None)
+    assert (after.config.engine.name, after.config.engine.threads, after.config.out) == ("auto", 0, None)
 
 
 def test_the_card_says_what_it_is_and_how_to_play_its_table(tmp_path: Path) -> None:
@@ -61,12 +71,102 @@ def test_the_card_says_what_it_is_and_how_to_play_its_table(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("case", ["no run", "no evaluation", "no notes"])
-def test_wrong_folders_are_one_line(case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_folders_are_one_line(
+    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     run = tmp_path / "nothing" if case == "no run" else save_run(tmp_path / "run")
     extra = ["--evaluation", str(tmp_path)] if case == "no evaluation" else []
     extra += ["--notes", str(tmp_path / "none.md")] if case == "no notes" else []
-    assert main([str(run), str(tmp_path / "kept"), *extra]) == 1
+    assert run_main(monkeypatch, str(run), str(tmp_path / "kept"), *extra) == 1
     error = capsys.readouterr().err
     assert error.startswith("error: ")
     assert error.count("\n") == 1
     assert not (tmp_path / "kept").exists()
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+
+def test_a_folder_with_other_files_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, precious = save_run(tmp_path / "run"), tmp_path / "precious"
+    precious.mkdir()
+    (precious / "thesis.txt").write_text("years of work")
+    policies = tmp_path / "pretrained"
+    keep(run, policies / "a")
+    keep(run, policies / "b")
+    before = files_of(tmp_path)
+    for folder, words in (
+        (precious, "holds other files"),
+        (policies, "holds other files"),  # the name of the policy was forgotten
+        (precious / "thesis.txt", "is no folder"),
+        (run, "holds the run itself"),
+        (run / "checkpoints" / "update_00000003", "holds the run itself"),
+        (run / "checkpoints", "holds the run itself"),
+        (tmp_path, "holds the run itself"),
+    ):
+        assert run_main(monkeypatch, str(run), str(folder)) == 1
+        error = capsys.readouterr().err
+        assert words in error
+        assert error.count("\n") == 1
+    assert files_of(tmp_path) == before
+    assert run_main(monkeypatch, str(policies / "a"), str(policies / "a")) == 1  # a policy into itself
+    assert run_main(monkeypatch, str(policies / "a"), str(policies)) == 1
+    assert files_of(tmp_path) == before
+
+
+def test_a_published_policy_is_replaced_and_other_files_in_it_stay(tmp_path: Path) -> None:
+    run, kept = save_run(tmp_path / "run"), tmp_path / "kept"
+    (tmp_path / "evaluation.json").write_text(json.dumps(EVALUATED))
+    keep(run, kept, tmp_path, "Old note.")
+    (kept / "sweep_of_mine").mkdir()
+    (kept / "sweep_of_mine" / "sweep.json").write_text("{}")
+    (kept / "notes.txt").write_text("mine")
+    keep(run, kept, kept, "New note.")  # with the evaluation that lies in it
+    assert "New note." in (kept / "README.md").read_text()
+    assert json.loads((kept / "evaluation.json").read_text()) == EVALUATED
+    assert (kept / "sweep_of_mine" / "sweep.json").read_text() == "{}"
+    assert (kept / "notes.txt").read_text() == "mine"
+    keep(run, kept)
+    assert not (kept / "evaluation.json").exists()  # it was of the policy before
+    assert (kept / "notes.txt").read_text() == "mine"
+    assert {path.name for path in tmp_path.iterdir()} == {"run", "kept", "evaluation.json"}
+
+
+def test_the_policies_of_the_repository_can_be_replaced(tmp_path: Path) -> None:
+    run = save_run(tmp_path / "run")
+    for policy in sorted(Path("pretrained").glob("*/")):
+        shutil.copytree(policy, tmp_path / policy.name)
+        assert "README.md" in {file.name for file in keep(run, tmp_path / policy.name)}
+
+
+def test_a_published_policy_can_be_published_again_elsewhere(tmp_path: Path) -> None:
+    old = Path("pretrained/pace")
+    keep(old, tmp_path / "new", old, "Another note.")
+    assert (tmp_path / "new" / "metrics.csv").read_text() == (old / "metrics.csv").read_text()
+    assert (tmp_path / "new" / "versions.json").read_bytes() == (old / "versions.json").read_bytes()
+    assert "Another note." in (tmp_path / "new" / "README.md").read_text()
+
+
+def test_a_policy_that_cannot_be_finished_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = save_run(tmp_path / "run")
+    keep(run, tmp_path / "kept", notes="Old note.")
+    before = files_of(tmp_path)
+
+    def fails(*_: object) -> str:
+        raise OSError("disk is full")
+
+    monkeypatch.setattr(publish, "card", fails)
+    with pytest.raises(OSError, match="disk is full"):
+        keep(run, tmp_path / "kept")
+    assert files_of(tmp_path) == before
+
+
+def test_an_empty_folder_may_be_written(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    keep(save_run(tmp_path / "run"), tmp_path / "empty")
+    assert load_policy(tmp_path / "empty").counters["updates"] == 3
+    with pytest.raises(KeepError, match="holds the run itself"):
+        keep(tmp_path / "run", tmp_path / "run" / ".." / "run")

@@ -24,7 +24,7 @@ def save(folder: Path, update: int) -> None:
 def main() -> int:
     """Play the part."""
     given = dict(argument.split("=", 1) for argument in sys.argv[1:])
-    folder = Path((given.get("resume") or given["run_dir"]).strip("'"))
+    folder = Path((given.get("resume") or given["out"]).strip("'"))
     folder.mkdir(parents=True, exist_ok=True)
     print(" ".join(sys.argv[1:]), flush=True)
     updates = int(float(given["samples"])) // ROW

@@ -11,10 +11,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from pace.command import run_command
 from pace.config.base import compose, parse
 from pace.config.training import TrainConfig
-from pace.predictor.__main__ import train_predictor
+from pace.predictor.__main__ import main
 from pace.predictor.regression import PredictorTrainer
 from pace.rl.practice import ServePractice
 from pace.runs.checkpoint import load_checkpoint
@@ -61,16 +60,16 @@ def test_the_learning_rate_falls_and_a_stop_keeps_what_was_learned(
 
     monkeypatch.setattr(PredictorTrainer, "update", update)
     overrides = ["num_worlds=64", "samples=3072", "minutes=0", "progress=false", "predictor.batches_per_update=2"]
-    monkeypatch.setattr(sys, "argv", ["train", f"run_dir={tmp_path}", *overrides])
-    assert run_command(train_predictor, "predictor_train") == 0
+    monkeypatch.setattr(sys, "argv", ["train", f"out={tmp_path}", *overrides])
+    assert main() == 0
     assert load_checkpoint(tmp_path).counters["updates"] == 3
     assert rates == pytest.approx([0.004, 0.00342, 0.00202], rel=0.01)
 
 
 def test_command_trains_and_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     overrides = ["num_worlds=256", "samples=120e3", "minutes=0", "progress=false", "predictor.batches_per_update=40"]
-    monkeypatch.setattr(sys, "argv", ["train", f"run_dir={tmp_path}", *overrides])
-    assert run_command(train_predictor, "predictor_train") == 0
+    monkeypatch.setattr(sys, "argv", ["train", f"out={tmp_path}", *overrides])
+    assert main() == 0
     result = json.loads((tmp_path / "predictor.json").read_text())
     assert result["errors"]["predictor_rmse_cm"] < 16.0
     assert result["errors"]["predictor_rmse_cm/0.1_0.2s"] < 12.0

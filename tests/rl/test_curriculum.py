@@ -72,7 +72,7 @@ def train(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
 
 def test_a_run_changes_its_task_and_resumes_exactly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, updates in (("whole", 4), ("parts", 2)):  # the parts meet where the stage begins
-        samples, folder = f"samples={updates * UPDATE}", f"run_dir={tmp_path / name}"
+        samples, folder = f"samples={updates * UPDATE}", f"out={tmp_path / name}"
         assert train(monkeypatch, *SMALL, WIDER, samples, folder) == 0
     assert train(monkeypatch, f"resume={tmp_path / 'parts'}", f"samples={4 * UPDATE}") == 0
     whole, parts = load_checkpoint(tmp_path / "whole"), load_checkpoint(tmp_path / "parts")
@@ -100,7 +100,7 @@ def test_a_run_changes_its_task_and_resumes_exactly(tmp_path: Path, monkeypatch:
 def test_a_wrong_stage_is_one_line_before_anything_is_played(
     stages: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    assert train(monkeypatch, *SMALL, f"curriculum={stages}", f"run_dir={tmp_path / 'run'}") == 2
+    assert train(monkeypatch, *SMALL, f"curriculum={stages}", f"out={tmp_path / 'run'}") == 2
     lines = [line for line in capfd.readouterr().err.splitlines() if not line.startswith("Warp")]
     assert len(lines) == 1
     assert message in lines[0]

@@ -35,7 +35,7 @@ def train(monkeypatch: pytest.MonkeyPatch):
 
 
 def real_run(train, path: Path, updates: int, *arguments: str) -> int:
-    return train(f"num_worlds={WORLDS}", f"samples={updates * UPDATE}", f"run_dir={path}", *SMALL, *arguments)
+    return train(f"num_worlds={WORLDS}", f"samples={updates * UPDATE}", f"out={path}", *SMALL, *arguments)
 
 
 def test_real_updates_and_an_exact_resume(train, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

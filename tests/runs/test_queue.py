@@ -45,7 +45,7 @@ def test_a_failed_run_does_not_lose_the_others_and_is_tried_again(
     assert all(run.finished for run in runs)
     told = {run.name: run.log.read_text().splitlines() for run in runs}
     assert told["one_seed1"] == [
-        f"experiment=one seed=1 run_dir='{tmp_path}/one_seed1' samples=4000.0 minutes=0 progress=false"
+        f"experiment=one seed=1 out='{tmp_path}/one_seed1' samples=4000.0 minutes=0 progress=false"
     ]
     assert told["fails_seed1"][2:] == [f"resume='{tmp_path}/fails_seed1' samples=4000.0 minutes=0 progress=false"]
 

@@ -14,7 +14,8 @@ from pace.config.base import ConfigError, compose, parse, to_dict
 from pace.config.commands import AblateConfig
 from pace.config.training import TrainConfig, load_train_config
 from pace.runs.metrics import Curve, Milestone, read_metrics
-from pace.studies.ablate import main, needed, over_seeds, planned_runs, summary
+from pace.studies.ablate import main
+from pace.studies.ablation import needed, over_seeds, planned_runs, summary
 
 FIGURE = "some.png"
 TINY = (
@@ -128,7 +129,7 @@ def test_every_experiment_gets_every_seed() -> None:
 def test_a_real_ablation_and_its_second_call(ablate, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     common = (
-        "experiments=[no_predictor,paper_reward]", "seeds=[3]", f"run_dir={tmp_path / 'runs'}", f"out={out}",
+        "experiments=[no_predictor,paper_reward]", "seeds=[3]", f"out={out}",
         f"window={UPDATE}", f"figure={FIGURE}", "progress=false", *TINY,
     )  # fmt: skip
     assert ablate(f"samples={2 * UPDATE}", "jobs=2", *common) == 0
@@ -152,5 +153,5 @@ def test_nothing_to_draw_and_unknown_experiments_are_one_line(
 ) -> None:
     assert ablate("train=false", f"out={tmp_path}") == 1
     assert "nothing to draw" in capsys.readouterr().err
-    assert ablate("experiments=[no_such]", f"run_dir={tmp_path}") == 2
+    assert ablate("experiments=[no_such]", f"out={tmp_path}") == 2
     assert "no_such" in capsys.readouterr().err

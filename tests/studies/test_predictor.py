@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import pytest
@@ -90,13 +91,19 @@ def test_the_command_prints_a_table_and_writes_a_figure(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(predictor, "STEPS", 6)
-    main(["predictor", "--serves", "6", "--cases", "rubber", "--predictors", "pretrained/pace", "--out", str(tmp_path)])
+    given = ["predictor", "serves=6", "cases=[rubber]", "predictors=[pretrained/pace]", f"out={tmp_path}"]
+    monkeypatch.setattr(sys, "argv", ["studies", *given])
+    assert main() == 0
     printed = capsys.readouterr().out
     assert printed.count("\n| rubber | ") == 3
     assert "| rubber | pace | " in printed
     assert (tmp_path / "predictor.png").stat().st_size > 10_000
 
 
-def test_a_predictor_that_is_not_there_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["predictor", "--cases", "rubber", "--predictors", str(tmp_path / "gone"), "--out", str(tmp_path)]) == 1
+def test_a_predictor_that_is_not_there_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = ["predictor", "cases=[rubber]", f"predictors=['{tmp_path / 'gone'}']", f"out={tmp_path}"]
+    monkeypatch.setattr(sys, "argv", ["studies", *given])
+    assert main() == 1
     assert "gone does not exist" in capsys.readouterr().err

@@ -10,7 +10,7 @@ import pytest
 from pace.config.base import config_dir
 from pace.config.training import load_train_config
 from pace.runs.metrics import Milestone, passage, read_curve
-from pace.studies.ablate import run_name
+from pace.studies.ablation import run_name
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "recipe"
 GONE = {"return_velocity_first", "campaign_first"}  # a reward term, and an observation, that were replaced

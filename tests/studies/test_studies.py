@@ -171,7 +171,8 @@ def test_the_commands_print_tables_and_write_figures(
     monkeypatch.setattr(reaction, "strike_all", lambda worlds: strikes)
     monkeypatch.setattr(reaction, "cost", lambda: 2e-4)
     monkeypatch.setattr(parity, "compare", lambda worlds: found)
-    main(["reaction", "parity", "--out", str(tmp_path)])
+    monkeypatch.setattr("sys.argv", ["studies", "reaction", "parity", f"out={tmp_path}"])
+    assert main() == 0
     printed = capsys.readouterr().out
     assert printed.count("\n| ") >= 2 + len(reaction.SPEEDS) + 2 + 2 * len(found) + 4
     assert "0.20 ms a control step" in printed

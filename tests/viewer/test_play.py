@@ -14,6 +14,8 @@ import numpy as np
 import pytest
 import torch
 
+from pace.command.arguments import name_options
+from pace.command.table import COMMANDS
 from pace.config.base import ConfigError, compose, parse
 from pace.config.commands import ExportConfig, PlayConfig
 from pace.deploy.export import ExportError, export_policy
@@ -22,8 +24,7 @@ from pace.runs.checkpoint import list_checkpoints
 from pace.sim import render
 from pace.sim.ball.ball import ball_preset
 from pace.sim.render import RenderError
-from pace.viewer import __main__ as play
-from pace.viewer.__main__ import video_option
+from pace.viewer.__main__ import main
 from pace.viewer.playback import Score, Serve, Show
 from pace.viewer.video import write_video
 from tests.helpers.browser import Chromium, find_chromium, wait_for
@@ -115,6 +116,9 @@ def test_what_the_marks_show(policy: TaskPolicy) -> None:
 
 
 def test_video_option() -> None:
+    def video_option(arguments: list[str]) -> list[str]:
+        return name_options(arguments, COMMANDS["play"])
+
     assert video_option(["r", "--video", "a.mp4", "seconds=2"]) == ["r", "video=a.mp4", "seconds=2"]
     assert video_option(["r", "--video=a.mp4"]) == ["r", "video=a.mp4"]
     assert video_option(["r", "video=a.mp4"]) == ["r", "video=a.mp4"]
@@ -150,7 +154,7 @@ def test_a_film_has_all_its_pictures(policy: TaskPolicy, tmp_path: Path) -> None
 
 def run_main(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     monkeypatch.setattr("sys.argv", ["play", *arguments])
-    return play.main()
+    return main()
 
 
 def test_bad_input_is_one_line(

@@ -1,0 +1,60 @@
+"""A measurement of this machine from its configuration.
+
+All is measured in one run, and what is compared by turns.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from pace.bench import physics, report, training, update
+from pace.config.base import parse
+from pace.config.commands import BenchConfig
+from pace.devices import resolve_device
+from pace.runs.run_folder import default_folder, versions
+
+BUSY_LOAD = 0.5  # a core; a busier machine is worth a word
+
+
+def bench_from_config(composed: DictConfig) -> None:
+    """Measure as the composed configuration says; print the table, write the JSON, say where."""
+    config = parse(composed, BenchConfig)
+    overrides = [o for o in HydraConfig.get().overrides.task if not o.lstrip("+~").startswith("bench")]
+    path = Path(config.out or default_folder(config.name)) / report.FILE
+    measure(config, overrides, path)
+    print(f"wrote {path}")
+
+
+def measure(config: BenchConfig, overrides: list[str], path: Path) -> dict[str, Any]:
+    """Run the parts that ``config`` names, print the table and write it to ``path``; returns the figures by name.
+
+    ``overrides`` are those of ``config`` that concern training: the training loop runs as a command of its own.
+    """
+    device = resolve_device(config.device)
+    machine = report.machine(device)
+    if machine["load"] > BUSY_LOAD:
+        print(f"the machine is busy (load {machine['load']:.1f} on {os.cpu_count()} cores): figures will be low")
+    parts = {
+        "physics": lambda: physics.native_rates(config),
+        "mjwarp": lambda: physics.mjwarp_rates(config, device),
+        "update": lambda: update.update_rates(config, device),
+        "train": lambda: training.train_rates(config, overrides),
+        "memory": lambda: training.memory_peak(config, overrides),
+    }
+    measured: dict[str, float] = {}
+    for name in config.bench.parts:
+        print(f"measuring {name} ...", flush=True)
+        started = time.perf_counter()
+        measured |= parts[name]()
+        print(f"  {time.perf_counter() - started:.0f} s", flush=True)
+    figures = report.complete(measured)
+    settings = {"num_worlds": config.num_worlds, "physics_steps": config.substeps, "repeats": config.bench.repeats}
+    report.write(path, figures, {"settings": settings, "device": str(device), "machine": machine, **versions()})
+    print(report.table(figures))
+    return figures

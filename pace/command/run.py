@@ -1,0 +1,105 @@
+"""Running a command so that wrong input ends in one line on stderr, not in a traceback."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from collections.abc import Callable, Sequence
+
+import hydra
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from pace.command.arguments import plain_overrides, prepare
+from pace.command.help import command_help
+from pace.command.table import COMMANDS, Command
+from pace.config.base import ConfigError, compose, config_dir, meant
+from pace.config.names import check_choice, split_override
+
+EXIT_USAGE = 2
+EXIT_FAILED = 1
+EXIT_INTERRUPTED = 130
+
+Task = Callable[[DictConfig], None]
+#: What a command does, and the errors of it that are expected.
+Work = tuple[Task, tuple[type[Exception], ...]]
+
+
+def run_command(name: str, load: Callable[[], Work]) -> int:
+    """Run the command ``name`` of :data:`COMMANDS` with ``sys.argv``; returns the exit status.
+
+    ``load`` imports and returns the work; it is called when the configuration is composed, for torch takes seconds to
+    load. The work gets that configuration. Wrong input gives one line and status 2, an expected error one line and 1.
+    """
+    try:
+        if {"-h", "--help"} & set(sys.argv[1:]):
+            print(command_help(name, _topic(sys.argv[1:])))
+            return 0
+        sys.argv[1:] = prepare(name, sys.argv[1:])
+    except ConfigError as error:
+        return complain(str(error), EXIT_USAGE)
+    try:
+        return _run_hydra(COMMANDS[name], load)
+    except (HydraException, OmegaConfBaseException) as error:
+        return complain(explain(name, sys.argv[1:], error), EXIT_USAGE)
+    except KeyboardInterrupt:
+        return complain("interrupted", EXIT_INTERRUPTED)
+
+
+def _topic(arguments: Sequence[str]) -> str:
+    """The group that stands behind ``--help``, if one does; a path there is the RUN of the command."""
+    index = min(arguments.index(flag) for flag in ("-h", "--help") if flag in arguments)
+    return next((argument for argument in arguments[index + 1 :] if re.fullmatch(r"\w+(=\w+)?", argument)), "")
+
+
+def _run_hydra(command: Command, load: Callable[[], Work]) -> int:
+    """Compose the command's configuration with ``sys.argv`` and do the work; returns the exit status."""
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises its errors instead of printing and exiting
+    status = 0
+
+    def guarded(config: DictConfig) -> None:
+        nonlocal status  # an error that reached Hydra would be announced a second time
+        try:
+            task, failures = load()
+        except ModuleNotFoundError as error:
+            if not command.extra or (error.name or "").startswith("pace"):
+                raise
+            status = complain(f"{error}: pip install 'pace-table-tennis[{command.extra}]'", EXIT_FAILED)
+            return
+        try:
+            task(config)
+        except ConfigError as error:
+            status = complain(str(error), EXIT_USAGE)
+        except failures as error:
+            status = complain(str(error), EXIT_FAILED)
+
+    hydra.main(config_path=str(config_dir()), config_name=command.config, version_base="1.3")(guarded)()
+    return status
+
+
+def explain(name: str, arguments: Sequence[str], error: Exception) -> str:
+    """A line on what Hydra cannot compose: the key or the choice that was probably meant."""
+    command = COMMANDS[name]
+    for override in plain_overrides(arguments):
+        key, value = split_override(override)
+        if key in command.groups and not {"--config-dir", "-cd"} & set(arguments):
+            try:
+                for choice in filter(None, value.strip("[]").split(",")):
+                    check_choice(key, choice.strip())
+            except ConfigError as wrong:
+                return str(wrong)
+    text = str(error).strip().splitlines()[0].rstrip(".")
+    unknown = re.match(r"Could not override '([\w.]+)'", text)
+    if not unknown:
+        return f"{text} (--help lists the keys)"
+    parent, _, key = unknown[1].rpartition(".")
+    there = OmegaConf.select(compose(command.config), parent) if parent else None
+    return f"there is no key '{unknown[1]}'{meant(key, there or ())} (--help lists the keys)"
+
+
+def complain(message: str, status: int) -> int:
+    """Print ``message`` as an error, and return ``status``."""
+    print(f"error: {message}", file=sys.stderr)
+    return status

@@ -1,0 +1,171 @@
+"""The commands of ``pace``: which configuration each has, and what of it the command line may give."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from pace.config.overrides import CHANGEABLE
+
+#: Groups of the training, in the order of configs/train.yaml.
+TRAIN_GROUPS = (
+    "robot", "ball", "serve", "reset", "reward", "randomization", "sensing", "observation", "engine", "algo",
+    "predictor", "experiment",
+)  # fmt: skip
+SAVED_RUN = (
+    "RUN is a run folder, a checkpoint in one, or pretrained/<name>. The task is the one that was saved with the "
+    "policy; change it as in training, by a choice of a group (ball=paper) or a value (engine.solver_iterations=20)."
+)
+
+
+@dataclass(frozen=True)
+class Command:
+    """One command. ``--help`` shows it, and arguments are checked against it."""
+
+    module: str  # python -m <module> is the same as pace <name>
+    config: str  # configs/<config>.yaml, whose keys it takes
+    summary: str  # one line
+    usage: str = "[key=value ...]"  # what stands behind its name
+    about: str = ""  # a paragraph of the help
+    examples: tuple[str, ...] = ()  # without the command's name
+    positional: tuple[str, ...] = ()  # keys of the arguments without a key, in order
+    rest: str = ""  # key of the list that takes all arguments without a key
+    options: tuple[str, ...] = ()  # keys that may be written --key value
+    flags: tuple[str, ...] = ()  # keys that may be written --key, for key=true
+    groups: tuple[str, ...] = ()  # choices of configs/ that it takes, and single values of them
+    training_keys: tuple[str, ...] = ()  # keys of configs/train.yaml that it takes besides its own
+    collected: bool = False  # what is of `groups` and `training_keys` goes into its key `overrides`, as a list
+    extra: str = ""  # of the package, that it may need
+    refused: dict[str, str] = field(default_factory=dict)  # key or group, which would change nothing -> what does
+
+
+COMMANDS = {
+    "train": Command(
+        module="pace.rl.train",
+        config="train",
+        summary="train a policy and its predictor",
+        about="Writes a run folder: configuration, versions, metrics, checkpoints and learning curve. Ctrl-C saves and "
+        "ends; resume= goes on exactly there.",
+        examples=(
+            "minutes=10 num_worlds=512 seed=3",
+            "experiment=paper device=cuda     # the paper's numbers",
+            "resume=runs/2026-01-01_pace minutes=60",
+            "init_from=runs/2026-01-01_pace ball=paper",
+            "reward.terms.success.weight=200 algo.gamma=0.97",
+        ),
+        groups=TRAIN_GROUPS,
+    ),
+    "evaluate": Command(
+        module="pace.evaluation",
+        config="evaluate",
+        summary="hits and returns of a policy in the paper's serve ranges, and its robustness (--sweep)",
+        usage="RUN [--sweep] [key=value ...]",
+        about=SAVED_RUN + " policy=zero and policy=random need no RUN. --sweep also plays the task with one change at "
+        "a time; with rows=[] that is all that is played, and out=FOLDER resumes an interrupted sweep.",
+        examples=(
+            "pretrained/pace serves=500 sensing=paper ball=paper",
+            "runs/2026-01-01_pace rows=[mixed] engine=mjwarp",
+            "policy=random serves=500 physics_dt=0.01",
+            "runs/2026-01-01_pace --sweep rows=[] out=runs/sweep",
+        ),
+        positional=("run",),
+        flags=("sweep",),
+        groups=CHANGEABLE,
+        collected=True,
+        refused={"serve": "rows= names the serve ranges, such as rows=[short]"},
+    ),
+    "play": Command(
+        module="pace.viewer",
+        extra="viewer",
+        config="play",
+        summary="a policy on a live page in the browser, or in a film (--video FILE)",
+        usage="RUN [--video FILE.mp4] [key=value ...]",
+        about=SAVED_RUN,
+        examples=(
+            "pretrained/pace",
+            "pretrained/pace ball=paper serve=short port=9000",
+            "runs/2026-01-01_pace --video out.mp4 seconds=30 speed=0.25",
+        ),
+        positional=("run",),
+        options=("video",),
+        groups=CHANGEABLE,
+        collected=True,
+    ),
+    "export": Command(
+        module="pace.deploy",
+        extra="export",
+        config="export",
+        summary="a policy as one ONNX file for the robot, checked against torch",
+        usage="RUN [key=value ...]",
+        about="RUN is a run folder, a checkpoint in one, or pretrained/<name>. Writes policy.onnx into the folder out.",
+        examples=("pretrained/pace", "runs/2026-01-01_pace out=runs/robot"),
+        positional=("run",),
+    ),
+    "ablate": Command(
+        module="pace.studies.ablate",
+        config="ablate",
+        summary="experiments x seeds, trained one after another, and the figure that compares them",
+        about="Runs, CSVs and figure are in the folder out. The same command again skips finished runs and resumes the "
+        "others. Keys and choices of the training change every run.",
+        examples=(
+            "out=runs/ablation jobs=2",
+            "experiments=[full,no_predictor] seeds=[7] samples=4e6 num_worlds=512",
+            "train=false out=docs/ablation     # table and figure again, from the CSVs",
+        ),
+        groups=tuple(group for group in TRAIN_GROUPS if group != "experiment"),
+        training_keys=("num_worlds", "processes", "device", "curriculum", "checkpoint_minutes", "tensorboard"),
+        collected=True,
+        refused={"experiment": "experiments= names them", "seed": "seeds= lists them", "minutes": "samples= ends runs"},
+    ),
+    "keep": Command(
+        module="pace.evaluation.keep",
+        config="keep",
+        summary="publish a policy: weights, metrics, evaluation and model card in one small folder",
+        usage="RUN FOLDER [--evaluation FOLDER] [--notes FILE.md]",
+        about="FOLDER must be new or empty, or hold a policy that this command wrote, which is replaced.",
+        examples=("runs/my_run pretrained/mine --evaluation runs/my_evaluation --notes notes.md",),
+        positional=("run", "out"),
+        options=("evaluation", "notes"),
+    ),
+    "bench": Command(
+        module="pace.bench",
+        config="bench",
+        summary="speed and memory of physics, environment, PPO update and training on this machine",
+        about="Writes bench.json. Choices and values of the training change what is measured; keep the machine idle.",
+        examples=("bench=quick num_worlds=64", "bench.parts=[physics,update] bench.repeats=11"),
+        groups=("bench", *TRAIN_GROUPS),
+        training_keys=("name", "num_worlds", "processes", "device", "seed", "init_from", "out"),
+        refused={"samples": "bench.train_updates says how long it trains", "minutes": "it ends by itself"},
+    ),
+    "validate": Command(
+        module="pace.studies.ball",
+        extra="dev",
+        config="validate",
+        summary="the ball's flight and rebounds against independent solutions (extra dev)",
+        about="Prints the numbers of docs/physics.md and draws its figures.",
+    ),
+    "predictor": Command(
+        module="pace.predictor",
+        config="predictor_train",
+        summary="train the predictor alone, on simulated serves without a robot",
+        about="Ball, serves, sensing and their randomisation are those of the training. A policy starts with the "
+        "result by init_from=RUN or predictor_from=RUN.",
+        examples=("predictor=paper sensing=clean samples=2e6", "predictor=filter randomization=wide minutes=4"),
+        groups=(
+            "robot", "ball", "serve", "reward", "randomization", "sensing", "engine", "algo", "predictor", "experiment",
+        ),
+        training_keys=(
+            "name", "num_worlds", "device", "seed", "samples", "minutes", "out", "tensorboard", "progress",
+        ),
+    ),
+    "studies": Command(
+        module="pace.studies",
+        extra="dev",
+        config="studies",
+        summary="engines, step sizes, motors, what a predictor can know, ...: measured anew (extra dev)",
+        usage="STUDY [STUDY ...] [key=value ...]",
+        about="Prints the tables of the documentation and draws their figures. STUDY: reaction, parity, steps, solver, "
+        "motors, predictor, posture, adaptation, senses, rounding, or all.",
+        examples=("parity worlds=16", "steps solver run=pretrained/pace", "predictor serves=512 cases=[rubber]"),
+        rest="studies",
+    ),
+}  # fmt: skip

@@ -1,0 +1,63 @@
+"""What an older version of pace saved, as this version reads it.
+
+A checkpoint holds the number of its format. When keys, choices or the saved state change, add a function to
+:data:`CONFIG_UPGRADES` or :data:`STATE_UPGRADES` with the format that it makes, and raise :data:`FORMAT` to that number
+unless it is raised already since the last release. Functions change what they get in place, and run in order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from copy import deepcopy
+from typing import Any
+
+from pace.config.names import RENAMED_CHOICES
+
+#: Of what this version writes. 1 is that of version 0.1.0 up to commit 43400ac.
+FORMAT = 2
+
+Saved = dict[str, Any]
+Upgrade = tuple[int, Callable[[Saved], None]]
+
+
+def name_the_folder_out(config: Saved) -> None:
+    """``run_dir``, the folder that a run writes, is ``out``."""
+    if "run_dir" in config:
+        config["out"] = config.pop("run_dir")
+
+
+def rename_choices(config: Saved) -> None:
+    """Choices, in each group's ``name`` and in the stages of the curriculum, are called as in ``RENAMED_CHOICES``."""
+    for group, part in config.items():
+        if isinstance(part, dict) and "name" in part:
+            new = RENAMED_CHOICES.get(f"{group}={part['name']}", f"{group}={part['name']}")
+            part["name"] = new.partition("=")[2]
+    for stage in config.get("curriculum") or []:
+        stage["task"] = [RENAMED_CHOICES.get(override, override) for override in stage["task"]]
+
+
+#: (format that it makes, function of the configuration).
+CONFIG_UPGRADES: list[Upgrade] = [(2, name_the_folder_out), (2, rename_choices)]
+#: (format that it makes, function of the training state: ``ppo``, ``regression`` and ``processes``, each of them with
+#: ``env`` and ``random``). Tensors are in their places.
+STATE_UPGRADES: list[Upgrade] = []
+
+
+def upgrade_config(config: Saved, version: int) -> Saved:
+    """A saved configuration of the format ``version``, in the current format; ``config`` stays as it is."""
+    changed = deepcopy(config)
+    for _, upgrade in _due(version, CONFIG_UPGRADES):
+        upgrade(changed)
+    return changed
+
+
+def upgrade_state(state: Saved, version: int) -> Saved:
+    """The training state of a checkpoint of the format ``version``, in the current format, changed in place."""
+    for _, upgrade in _due(version, STATE_UPGRADES):
+        upgrade(state)
+    return state
+
+
+def _due(version: int, upgrades: Sequence[Upgrade]) -> list[Upgrade]:
+    """Those that make a later format than ``version``, the earliest first."""
+    return sorted((upgrade for upgrade in upgrades if upgrade[0] > version), key=lambda upgrade: upgrade[0])

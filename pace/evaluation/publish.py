@@ -1,0 +1,121 @@
+"""Publishing a policy: a folder small enough for a repository, with the policy, how it was trained and how it plays.
+
+It holds the weights (float32) and the configuration of a run's newest checkpoint, or of a checkpoint, without the
+training state; beside them the main columns of the run's metrics, its learning curve, the tables and figures of an
+evaluation and of a sweep, and a model card (README.md).
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from pace.config.base import parse
+from pace.config.commands import KeepConfig
+from pace.evaluation.card import CARD, card
+from pace.rl.policies import locate
+from pace.runs.checkpoint import FOLDER, META, WEIGHTS, CheckpointError, export_weights, find_checkpoint
+from pace.runs.metrics import write_slim
+from pace.runs.run_folder import METRICS
+
+RUN_FILES = ("learning_curve.png", "versions.json")
+EVALUATION_FILES = ("evaluation.json", "evaluation.md", "evaluation.csv", "strike_map.png", "landing_map.png")
+SWEEP_FILES = ("sweep.json", "sweep.png")
+#: All that this module writes into a folder; other files there are not its own.
+FILES = (META, WEIGHTS, METRICS, CARD, *RUN_FILES, *EVALUATION_FILES, *SWEEP_FILES)
+
+
+class KeepError(RuntimeError):
+    """A policy that cannot be published there; the message says why, and nothing was changed."""
+
+
+def keep_from_config(composed: DictConfig) -> None:
+    """Publish as the composed configuration says, and print what was written."""
+    config = parse(composed, KeepConfig)
+    assert config.run is not None  # guaranteed by KeepConfig
+    assert config.out is not None
+    try:
+        notes = Path(config.notes).read_text() if config.notes else ""
+        evaluation = Path(config.evaluation) if config.evaluation else None
+        files = keep(locate(config.run), Path(config.out), evaluation, notes)
+    except (OSError, UnicodeDecodeError) as error:
+        raise KeepError(str(error)) from error
+    for file in files:
+        print(f"wrote {file} ({file.stat().st_size / 1024:.0f} KiB)")
+
+
+def keep(run: Path, folder: Path, evaluation: Path | None = None, notes: str = "") -> list[Path]:
+    """Publish ``run`` and its ``evaluation`` as ``folder``, with ``notes`` in the card; returns the files written.
+
+    The folder appears when it is whole. A published policy that is there is replaced; files in it that this function
+    did not write stay.
+
+    Errors: :class:`CheckpointError` for a run that is none, or an evaluation folder without one; :class:`KeepError`
+    for a folder that holds anything else, or the run.
+    """
+    checkpoint = find_checkpoint(run)
+    if evaluation is not None and not (evaluation / "evaluation.json").is_file():
+        raise CheckpointError(f"{evaluation} holds no evaluation.json: give a folder that pace evaluate wrote")
+    require_own(folder, run, checkpoint)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".keep_") as scratch:
+        fresh = Path(scratch) / folder.resolve().name  # the card is headed by this name
+        written = write_policy(fresh, checkpoint, evaluation, notes)
+        if folder.is_dir():
+            copy_others(folder, fresh)
+            folder.rename(Path(scratch) / "old")
+        fresh.rename(folder)
+    return [folder / name for name in written]
+
+
+def require_own(folder: Path, run: Path, checkpoint: Path) -> None:
+    """Errors: :class:`KeepError` unless ``folder`` is new, empty or a published policy, and does not hold the run."""
+    place = folder.resolve()
+    if any(path.resolve().is_relative_to(place) for path in (run, checkpoint)):
+        raise KeepError(f"{folder} holds the run itself: give another folder, such as pretrained/mine")
+    if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
+        raise KeepError(f"{folder} is no folder: give a new one, such as pretrained/mine")
+    if folder.is_dir() and any(folder.iterdir()) and not is_published(folder):
+        raise KeepError(f"{folder} holds other files, which are not replaced: give a new folder, such as {folder}/mine")
+
+
+def is_published(folder: Path) -> bool:
+    """Whether this module wrote ``folder``: it holds a card, and a checkpoint that has weights only."""
+    if not all((folder / name).is_file() for name in (CARD, META, WEIGHTS)):
+        return False
+    try:
+        meta = json.loads((folder / META).read_text())
+    except ValueError:
+        return False
+    return isinstance(meta, dict) and "config" in meta and meta.get("training") is None
+
+
+def write_policy(folder: Path, checkpoint: Path, evaluation: Path | None, notes: str) -> list[str]:
+    """Write all of a published policy into the new ``folder``; returns the names of the files."""
+    export_weights(checkpoint, folder)
+    of_a_run = checkpoint.parent.name == FOLDER  # or else of a published policy, whose metrics are short already
+    run = checkpoint.parent.parent if of_a_run else checkpoint
+    sources = [run / name for name in RUN_FILES]
+    sources += [evaluation / name for name in EVALUATION_FILES + SWEEP_FILES] if evaluation is not None else []
+    for source in sources:
+        if source.is_file():
+            shutil.copyfile(source, folder / source.name)
+    if (run / METRICS).is_file():
+        (write_slim if of_a_run else shutil.copyfile)(run / METRICS, folder / METRICS)
+    (folder / CARD).write_text(card(folder, notes))
+    return sorted(file.name for file in folder.iterdir())
+
+
+def copy_others(old: Path, fresh: Path) -> None:
+    """Copy what lies in ``old``, and is not of this module, into ``fresh``."""
+    for entry in old.iterdir():
+        if entry.name in FILES:
+            continue
+        if entry.is_dir() and not entry.is_symlink():
+            shutil.copytree(entry, fresh / entry.name, symlinks=True)
+        else:
+            shutil.copy2(entry, fresh / entry.name, follow_symlinks=False)

@@ -1,0 +1,107 @@
+"""The predictor trained alone, on simulated serves without a robot.
+
+Serves do not depend on the robot, so the predictor can be trained before any policy. The ball, its randomisation, the
+sensors' delay and noise and the meaning of the outputs are those of the task, from the same code and configuration.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from pathlib import Path
+
+import torch
+from omegaconf import DictConfig
+
+from pace.config.base import ConfigError, parse, to_dict
+from pace.config.training import TrainConfig
+from pace.devices import resolve_device
+from pace.predictor.network import PredictorNetwork
+from pace.predictor.regression import PredictorTrainer
+from pace.rl.practice import ServePractice
+from pace.runs.checkpoint import FOLDER, Checkpoint, save_checkpoint
+from pace.runs.interrupt import StopRequest
+from pace.runs.progress import Progress
+from pace.runs.run_folder import METRICS, RunFolder, default_folder
+
+RESULT = "predictor.json"
+FINAL_ROLLOUTS = 20  # rollouts of the final measurement, which are never fitted
+
+
+class PredictorRun:
+    """Trains one predictor on :class:`ServePractice` until ``samples`` or ``minutes``, and measures it."""
+
+    def __init__(self, config: TrainConfig) -> None:
+        if not config.predictor.enabled:
+            raise ConfigError("predictor.enabled is false: there is nothing to train")
+        device = resolve_device(config.device)
+        torch.manual_seed(config.seed)
+        self.config = config
+        self.network = PredictorNetwork(config.predictor).to(device)
+        self.practice = ServePractice(config, device)
+        self.practice.spread()
+        self.trainer = PredictorTrainer(self.network, config.predictor, config.algo.steps, config.num_worlds)
+
+    def play(self) -> None:
+        """Record one rollout."""
+        for t in range(self.trainer.steps):
+            self.practice.advance()
+            self.trainer.record(t, self.practice)
+
+    def slow_down(self, done: float) -> None:
+        """Learning rate for the share ``done`` of the way: half a cosine, to a hundredth of ``learning_rate``."""
+        factor = 0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * done))
+        for group in self.trainer.optimiser.param_groups:
+            group["lr"] = factor * self.config.predictor.learning_rate
+
+    def train(self, run: RunFolder) -> dict[str, float]:
+        """Fit rollout after rollout, each measured before it is fitted, to the end or to the first Ctrl-C or SIGTERM;
+        returns updates, samples and seconds."""
+        config, per_update = self.config, self.config.num_worlds * self.config.algo.steps
+        progress = Progress(config.progress, config.samples, 60.0 * config.minutes, shown=["predictor_rmse_cm"])
+        started = last = time.monotonic()
+        update, limit, stop = 0, 60.0 * config.minutes if config.minutes > 0 else math.inf, StopRequest()
+        with stop.listening():
+            while (done := max(update * per_update / config.samples, (last - started) / limit)) < 1 and not stop.name:
+                self.slow_down(done)
+                self.play()
+                update += 1
+                errors, now = self.trainer.update(), time.monotonic()
+                row = {"update": update, "samples": update * per_update, "wall_s": now - started, **errors}
+                row["samples_per_s"] = per_update / (now - last)
+                last = now
+                run.log(row)
+                progress.show(row)
+        progress.close()
+        return {"updates": update, "samples": update * per_update, "wall_s": last - started}
+
+    def measure(self) -> dict[str, float]:
+        """RMSE in cm, root of the mean square over rollouts that are not fitted; NaN bins are left out."""
+        squares: dict[str, list[float]] = {}
+        for _ in range(FINAL_ROLLOUTS):
+            self.play()
+            for name, value in self.trainer.errors().items():
+                squares.setdefault(name, []).extend([value**2] if value == value else [])
+        return {name: (sum(values) / len(values)) ** 0.5 for name, values in squares.items() if values}
+
+
+def train_predictor(composed: DictConfig) -> None:
+    """Train as the composed configuration says, and print what was written."""
+    config = parse(composed, TrainConfig)
+    session = PredictorRun(config)
+    config.out = config.out or str(default_folder(config.name))
+    run = RunFolder(Path(config.out), to_dict(config), config.tensorboard)
+    print(f"training the predictor on serves in {config.num_worlds} worlds, run folder {run.path}", flush=True)
+    counters = session.train(run)
+    run.close()
+    errors = session.measure()
+    weights = {"predictor": session.network.state_dict()}
+    folder = run.path / FOLDER / f"update_{int(counters['updates']):08d}"
+    save_checkpoint(folder, Checkpoint(to_dict(config), counters, weights, None))
+    result = {"errors": errors, "counters": counters, "ball": config.ball.name, "serve": config.serve.name}
+    (run.path / RESULT).write_text(json.dumps(result, indent=1))
+    for name, value in errors.items():
+        print(f"{name}: {value:.2f}")
+    for file in (folder, run.path / RESULT, run.path / METRICS):
+        print(f"wrote {file}")

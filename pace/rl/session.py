@@ -1,0 +1,164 @@
+"""A training run from its configuration: new, resumed, or started from other weights; alone or in several processes.
+
+This is what ``python -m pace.rl.train`` does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+
+from pace.config.base import ConfigError, parse, to_dict
+from pace.config.training import RESUME_KEYS, TrainConfig
+from pace.devices import resolve_device, threads_of
+from pace.distributed import Team, own_device, suitable_size, team_of
+from pace.predictor.network import PredictorNetwork
+from pace.rl.curriculum import Curriculum
+from pace.rl.policies import locate
+from pace.rl.trainer import Summary, Trainer, begins_anew, played_on
+from pace.runs.checkpoint import Checkpoint, CheckpointError, load_checkpoint
+from pace.runs.progress import rate_texts
+from pace.runs.run_folder import CURVE, METRICS, RunFolder, default_folder
+
+if TYPE_CHECKING:
+    from pace.task.env import TableTennisEnv
+SEEDS_APART = 1_000_003  # between the stages of a curriculum: further than seeds of runs lie apart
+
+
+def train_from_config(composed: DictConfig) -> None:
+    """Train as the composed configuration says, and print what was written."""
+    config = parse(composed, TrainConfig)
+    hydra = HydraConfig.get()
+    overrides = list(hydra.overrides.task)
+    if config.resume:
+        saved = load_checkpoint(config.resume)
+        config = resumed_config(saved, config.resume, overrides)
+    else:
+        saved = None
+    device = resolve_device(own_device(config.device))
+    if saved and device.type != played_on(saved) and not any(key.startswith("processes=") for key in overrides):
+        config.processes = 0  # as many as suit this kind of device
+    config.processes = config.processes or suitable_size(config.num_worlds, device)
+    arguments = overrides if hydra.mode == RunMode.MULTIRUN else None  # of this job; the command's are of all
+    with team_of(config.processes, device, arguments) as team:
+        trainer = build_trainer(config, saved, device, team)
+        if trainer.run is not None:
+            announce(trainer, trainer.run, saved)
+        summary = trainer.train()
+    if summary is not None:
+        report(summary)
+
+
+def resumed_config(saved: Checkpoint, path: str, overrides: list[str]) -> TrainConfig:
+    """The saved configuration with the limits of the command line.
+
+    Errors: :class:`ConfigError` for an override of anything that a resumed run may not change.
+    """
+    for override in overrides:
+        key = override.split("=")[0].lstrip("+~")
+        if key not in RESUME_KEYS:
+            raise ConfigError(f"'{key}' cannot change in a resumed run ({', '.join(RESUME_KEYS)} can): use init_from")
+    changed = OmegaConf.merge(OmegaConf.create(saved.config), OmegaConf.from_dotlist(overrides))
+    config = parse(OmegaConf.to_container(changed), TrainConfig)  # type: ignore[arg-type]
+    config.resume, config.init_from, config.predictor_from = path, None, None
+    if saved.counters["samples"] >= config.samples:
+        raise ConfigError(f"{path} has {saved.counters['samples']} samples: give samples= above that to go on")
+    if saved.path is not None:  # where the run lies now; it may have been moved or copied since it was saved
+        config.out = str(saved.path.parent.parent)
+    return config
+
+
+def build_trainer(config: TrainConfig, saved: Checkpoint | None, device: torch.device, team: Team) -> Trainer:
+    """Networks, this process's worlds and the leader's run folder; state from ``saved`` or :func:`first_weights`.
+
+    Errors: :class:`ConfigError` for worlds that the team cannot share equally.
+    """
+    if config.num_worlds % team.size:
+        raise ConfigError(f"num_worlds {config.num_worlds} cannot be shared equally by {team.size} processes")
+    start = first_weights(config)
+    torch.manual_seed(config.seed)
+    predictor = PredictorNetwork(config.predictor).to(device)
+    anew = saved is not None and begins_anew(saved, team, device)
+    again = int(saved.counters["updates"]) if saved and anew else 0  # or the run's beginning would be drawn once more
+    make = partial(make_worlds, device=device, team=team, predictor=predictor, again=again)
+    curriculum = Curriculum(config, make, saved.counters["samples"] if saved else 0.0)
+    run = open_run(config, int(saved.counters["updates"]) if saved else 0) if team.leads else None
+    trainer = Trainer(config, curriculum.worlds, predictor, run, team, curriculum)
+    torch.manual_seed(team.seed(config.seed + again))  # the networks began alike, what is played does not
+    if saved:
+        trainer.resume(saved)
+    elif start:
+        trainer.start_from(start)
+    return trainer
+
+
+def make_worlds(
+    task: TrainConfig, stage: int, device: torch.device, team: Team, predictor: PredictorNetwork, again: int = 0
+) -> TableTennisEnv:
+    """This process's worlds of one stage of the curriculum; each stage draws from random numbers of its own.
+
+    ``again``: another number makes other draws, for worlds that begin anew in a run.
+    """
+    from pace.task.env import TableTennisEnv
+
+    threads = task.engine.threads or threads_of(team.size)
+    task = replace(task, engine=replace(task.engine, threads=threads))
+    seed = team.seed(task.seed + SEEDS_APART * stage + again)
+    return TableTennisEnv(task, task.num_worlds // team.size, device, seed, predictor)
+
+
+def first_weights(config: TrainConfig) -> Checkpoint | None:
+    """What a new run starts from: ``config.init_from`` with the predictor of ``config.predictor_from``, or one of them.
+
+    Errors: :class:`CheckpointError` for one that cannot be read.
+    """
+    start = load_checkpoint(locate(config.init_from), weights_only=True) if config.init_from else None
+    if not config.predictor_from:
+        return start
+    given = load_checkpoint(locate(config.predictor_from), weights_only=True)
+    if "predictor" not in given.weights:
+        raise CheckpointError(f"{given.path} has no predictor: give predictor_from a run of pace predictor")
+    if start is None:
+        return replace(given, weights={"predictor": given.weights["predictor"]})
+    return replace(start, weights=start.weights | {"predictor": given.weights["predictor"]})
+
+
+def open_run(config: TrainConfig, first_update: int) -> RunFolder:
+    """The run folder that ``config`` names, or a new one, whose path ``config`` then holds."""
+    config.out = config.out or str(default_folder(config.name))
+    return RunFolder(Path(config.out), to_dict(config), config.tensorboard, first_update)
+
+
+def announce(trainer: Trainer, run: RunFolder, saved: Checkpoint | None) -> None:
+    """Print what is about to be trained, on what, from what, and where it is kept."""
+    if saved is not None:
+        anew = ", with worlds that begin anew" if begins_anew(saved, trainer.team, trainer.device) else ""
+        print(f"going on from {saved.path}{anew}")
+    shared = f" in {trainer.team.size} processes" if trainer.team.size > 1 else ""
+    agent = trainer.agent
+    number_format = str(agent.observation_dtype).removeprefix("torch.")
+    if agent.observation_dtype != torch.float32 and agent.fp32_below > 0.0:
+        number_format += f" (float32 below a std of {agent.fp32_below:g})"
+    print(
+        f"training {trainer.config.name}: {trainer.config.num_worlds} worlds on {trainer.device}{shared}, "
+        f"networks in {number_format}, run folder {run.path}",
+        flush=True,
+    )
+
+
+def report(summary: Summary) -> None:
+    """Print how the run ended and which files it wrote."""
+    folder = summary.checkpoint.parent.parent
+    print(
+        f"{summary.reason}: {summary.updates} updates, {summary.samples:,} samples, {summary.seconds / 60:.1f} min\n"
+        f"last updates: {', '.join(rate_texts(summary.rates))}\n"
+        f"wrote {summary.checkpoint}\n"
+        f"wrote {folder / METRICS}" + (f"\nwrote {folder / CURVE}" if summary.curve else "")
+    )

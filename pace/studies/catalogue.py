@@ -1,0 +1,156 @@
+"""The studies by name: engines against each other, step sizes, solver settings, paddle reaction, motors, what a
+predictor can know, how a policy stands, whether it finds out its paddle, what it makes of its sensors, and what bf16
+rounding does to its learning.
+
+They print the tables of the documentation and draw their figures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+from matplotlib.figure import Figure
+from omegaconf import DictConfig
+
+from pace.config.base import meant, parse, require
+from pace.config.commands import StudiesConfig
+from pace.rl.policies import load_predictor
+from pace.runs.run_folder import default_folder
+from pace.studies import adaptation, motors, parity, posture, predictor, reaction, rounding, senses, steps
+from pace.studies.swings import Swings, policy_swings, random_swings
+
+CAMPAIGN = Path("pretrained/campaign")
+
+
+@dataclass(frozen=True)
+class Options:
+    """What a study looks at, and how much of it; see configs/studies.yaml."""
+
+    worlds: int
+    serves: int
+    run: Path | None
+    cases: list[str]
+    predictors: list[Path]
+    out: Path
+
+
+def _save(out: Path, name: str, size: tuple[float, float], draw: Callable[[Figure], None]) -> None:
+    with plt.rc_context({"axes.spines.top": False, "axes.spines.right": False, "font.size": 9}):
+        figure = plt.figure(figsize=size, layout="constrained")
+        draw(figure)
+        out.mkdir(parents=True, exist_ok=True)
+        figure.savefig(out / f"{name}.png", dpi=90)
+        plt.close(figure)
+    print(f"wrote {out / name}.png")
+
+
+def study_reaction(options: Options) -> None:
+    strikes = reaction.strike_all(options.worlds)
+    print(reaction.table(strikes))
+    print(f"cost: {1e3 * reaction.cost():.2f} ms a control step of 1,024 worlds")
+    _save(options.out, "paddle_reaction", (9, 3.2), lambda figure: reaction.draw(strikes, figure))
+
+
+def study_parity(options: Options) -> None:
+    found = parity.compare(options.worlds)
+    print(parity.table(found))
+    print()
+    print(parity.strike_table(found))
+    _save(options.out, "engine_parity", (9.5, 3.2), lambda figure: parity.draw(found, figure))
+
+
+def _swings(options: Options) -> Swings:
+    swings = policy_swings(options.run, options.worlds, 150) if options.run else random_swings(options.worlds, 150)
+    print(f"{swings.source}, {options.worlds} worlds for {0.02 * len(swings.targets):g} s")
+    return swings
+
+
+def study_steps(options: Options) -> None:
+    cases = steps.step_cases(_swings(options).windows(steps.LENGTH))
+    print(steps.table(cases))
+    _save(options.out, "step_size", (9.5, 3.2), lambda figure: steps.draw_steps(cases, figure))
+
+
+def study_solver(options: Options) -> None:
+    print(steps.table(steps.solver_cases(_swings(options).windows(steps.LENGTH))))
+
+
+def study_motors(options: Options) -> None:
+    cost = motors.cost()
+    print(", ".join(f"{case} the limit {1e6 * spent:.1f} us" for case, spent in cost.items()), "a step of a world")
+    print(motors.table(motors.uses(_policies(options), options.worlds, options.serves)))
+
+
+def study_posture(options: Options) -> None:
+    print(posture.table(posture.postures(_policies(options), options.worlds, options.serves)))
+
+
+def study_adaptation(options: Options) -> None:
+    found = adaptation.adaptations(_policies(options), options.worlds)
+    print(adaptation.table(found))
+    _save(options.out, "adaptation", (11.5, 3.2), lambda figure: adaptation.draw(found, figure))
+
+
+def study_senses(options: Options) -> None:
+    print(senses.table(senses.sense(options.run or CAMPAIGN, options.worlds)))
+
+
+def study_rounding(options: Options) -> None:
+    print(rounding.table(rounding.measure(options.run or CAMPAIGN, options.worlds)))
+
+
+def _policies(options: Options) -> list[Path]:
+    kept = sorted(path.parent for path in Path("pretrained").glob("*/checkpoint.json"))
+    return [options.run] if options.run else kept
+
+
+def study_predictor(options: Options) -> None:
+    for run in options.predictors:
+        load_predictor(run)  # wrong ones are told before minutes of bounds
+    found = []
+    for case in options.cases or predictor.CASES:
+        found.append(predictor.compare(case, options.serves, options.predictors))
+        print(f"{case}: done", flush=True)
+    print(predictor.table(found))
+    _save(options.out, "predictor", (9.5, 3.6), lambda figure: predictor.draw(found, figure))
+
+
+STUDIES = {
+    "reaction": study_reaction,
+    "parity": study_parity,
+    "steps": study_steps,
+    "solver": study_solver,
+    "motors": study_motors,
+    "predictor": study_predictor,
+    "posture": study_posture,
+    "adaptation": study_adaptation,
+    "senses": study_senses,
+    "rounding": study_rounding,
+}
+
+
+def study_from_config(composed: DictConfig) -> None:
+    """Do the studies that the composed configuration names.
+
+    Errors: :class:`ConfigError` for a name that is not there; :class:`pace.runs.checkpoint.CheckpointError`.
+    """
+    config = parse(composed, StudiesConfig)
+    names = list(STUDIES) if config.studies == ["all"] else config.studies
+    require(len(names) > 0, f"which study? {', '.join(STUDIES)}, or all")
+    for kind, given, known in (("study", names, list(STUDIES)), ("case", config.cases, list(predictor.CASES))):
+        for name in given:
+            require(name in known, f"there is no {kind} '{name}'{meant(name, known)} ({', '.join(known)})")
+    options = Options(
+        worlds=config.worlds,
+        serves=config.serves,
+        run=Path(config.run) if config.run else None,
+        cases=config.cases,
+        predictors=[Path(path) for path in config.predictors],
+        out=Path(config.out) if config.out else default_folder("studies"),
+    )
+    for name in names:
+        print(f"\n== {name}")
+        STUDIES[name](options)

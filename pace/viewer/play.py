@@ -1,0 +1,56 @@
+"""A policy to watch, from its configuration: a live page, or a film."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from omegaconf import DictConfig
+from tqdm import tqdm
+
+from pace.config.base import parse
+from pace.config.commands import PlayConfig
+from pace.evaluation.sweep import ball_presets
+from pace.rl.policies import TaskPolicy, load_policy
+from pace.runs.progress import SECONDS_PER_LINE
+from pace.viewer.playback import Show
+from pace.viewer.video import write_video
+from pace.viewer.web import Page
+
+
+def play_from_config(composed: DictConfig) -> None:
+    """Play as the composed configuration says, and print where to look."""
+    config = parse(composed, PlayConfig)
+    assert config.run is not None  # PlayConfig has seen to it
+    policy = load_policy(config.run)
+    overrides = [f"engine.physics_dt={config.physics_dt}", *config.overrides]
+    if config.video:
+        film(config, policy, overrides)
+    else:
+        page(config, policy, overrides)
+
+
+def page(config: PlayConfig, policy: TaskPolicy, overrides: list[str]) -> None:
+    """Show the page until Ctrl-C."""
+    shown = Page(policy, overrides, ball_presets(), config.host, config.port, config.speed, config.seed)
+    print(f"policy {policy.source}\nopen {shown.url} in a browser; Ctrl-C ends it", flush=True)
+    try:
+        shown.run()
+    except KeyboardInterrupt:
+        print("\nended")
+
+
+def film(config: PlayConfig, policy: TaskPolicy, overrides: list[str]) -> None:
+    """Write the film."""
+    assert config.video
+    file, show = Path(config.video), Show(policy, overrides, config.seed)
+    total = round(config.seconds * config.fps / config.speed)
+    size = (config.width, config.height)
+    interval = 0.2 if sys.stderr.isatty() else SECONDS_PER_LINE
+    with tqdm(total=total, desc=file.name, unit="picture", mininterval=interval) as bar:
+        write_video(file, show, config.seconds, config.fps, config.speed, *size, on_picture=lambda: _tick(bar))
+    print(f"policy {policy.source}\n{show.score.text()}\nwrote {file}")
+
+
+def _tick(bar: tqdm) -> None:
+    bar.update()

@@ -1,0 +1,229 @@
+"""``pace`` and its commands: the list, the help, and one line for what is written wrong."""
+
+from __future__ import annotations
+
+import runpy
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from pace.__main__ import main
+from pace.command.help import WIDTH, command_help, command_keys
+from pace.command.keys import file_keys, heading
+from pace.command.table import COMMANDS
+from pace.config import names
+from pace.config.base import compose, config_dir
+from pace.config.names import choices
+from pace.moved import MOVED
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    """``pace ...`` in this process; returns its exit status."""
+    monkeypatch.setattr(sys, "argv", ["pace", *arguments])
+    try:
+        return main()
+    except SystemExit as end:
+        return int(end.code or 0)
+
+
+def error_line(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """The one line on stderr of a command that is used wrongly."""
+    assert run(monkeypatch, *arguments) == 2
+    lines = [line for line in capfd.readouterr().err.splitlines() if not line.startswith("Warp")]
+    assert len(lines) == 1
+    assert lines[0].startswith("error: ")
+    return lines[0].removeprefix("error: ")
+
+
+def test_commands_are_listed_a_line_each(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments in ((), ("--help",), ("help",)):
+        assert run(monkeypatch, *arguments) == 0
+        lines = capsys.readouterr().out.splitlines()
+        assert [line.split()[1] for line in lines if line.startswith("  pace ")] == list(COMMANDS)
+        assert max(len(line) for line in lines) <= 110
+
+
+def test_help_loads_neither_torch_nor_warp() -> None:
+    code = "import sys, runpy\nsys.argv = sys.argv[1:]\ntry: runpy.run_module({!r}, run_name='__main__')\n"
+    code += "except SystemExit: pass\nprint(sorted({{'torch', 'warp', 'mujoco'}} & set(sys.modules)))"
+    for module in ("pace", *(command.module for command in COMMANDS.values())):
+        given = [sys.executable, "-c", code.format(module), "pace", "--help"]
+        done = subprocess.run(given, capture_output=True, text=True, timeout=60)
+        assert done.stdout.endswith("[]\n"), module
+        assert done.stderr == ""
+
+
+@pytest.mark.parametrize("name", sorted(COMMANDS))
+def test_help_shows_every_key_of_the_command_with_its_default_and_nothing_else(name: str) -> None:
+    command, text = COMMANDS[name], command_help(name)
+    composed = compose(command.config)
+    assert text.startswith(f"pace {name} {command.usage}\n")
+    assert f"python -m {command.module}" in text
+    assert f"{command.summary[1:]}." in text
+    assert all(len(line) <= WIDTH for line in text.splitlines() if f"  pace {name}" not in line)
+    shown = {line.split("=")[0].strip() for line in text.splitlines() if line.startswith("  ") and "=" in line}
+    for key in command_keys(command):
+        assert key in shown
+    groups = {key for key in composed if (config_dir() / str(key)).is_dir()}
+    given = {str(key) for key in composed} - groups - {"overrides"}
+    if name not in ("bench", "predictor", "ablate"):  # those take a part of the training's keys
+        assert {key.split(".")[0] for key in command_keys(command)} == given
+    assert all(f"  {group}=" in text or f"  {group}.KEY=" in text for group in command.groups)
+    assert ("--help GROUP" in text) == bool(command.groups)
+
+
+@pytest.mark.parametrize("name", sorted(COMMANDS))
+def test_every_key_of_a_command_is_explained(name: str) -> None:
+    exempt = ("paper.", "variations.engine")
+    assert [
+        key.name for key in command_keys(COMMANDS[name]).values() if not key.comment and not key.name.startswith(exempt)
+    ] == []
+
+
+def test_a_group_is_shown_with_the_units_of_its_file() -> None:
+    text = command_help("train", "serve")
+    assert "serve.vx=[-6.5, -5.0]" in text
+    assert "m/s" in text.split("serve.vx=")[1].splitlines()[0]
+    assert "serve.vx=[-5.7, -5.2]" in command_help("train", "serve=short")
+    assert "Training serves" in text
+    rubber = command_help("train", "ball")
+    assert "ball.table.length=2.74" in rubber  # of the file that it takes over
+    assert "_table" not in rubber
+
+
+def test_options_of_hydra_may_stand_anywhere(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(monkeypatch, "evaluate", "runs/a", "--cfg", "job", "ball=paper", "serves=7") == 0
+    printed = capsys.readouterr().out
+    assert "serves: 7" in printed
+    assert "- ball=paper" in printed
+
+
+def test_help_may_stand_before_the_run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    texts = []
+    for arguments in (("--help", "runs/a"), ("runs/a", "--help"), ("-h",)):
+        assert run(monkeypatch, "evaluate", *arguments) == 0
+        texts.append(capsys.readouterr().out)
+    assert texts[0] == texts[1] == texts[2]
+
+
+@pytest.mark.parametrize("group", sorted(path.name for path in config_dir().iterdir() if path.is_dir()))
+def test_every_choice_of_every_group_has_a_help(group: str) -> None:
+    for choice in choices(group):
+        text = command_help("bench", f"{group}={choice}")
+        assert all(len(line) <= WIDTH for line in text.splitlines())
+
+
+def test_comments_belong_to_their_keys(tmp_path: Path) -> None:
+    (tmp_path / "_base.yaml").write_text("low: 1   # m\nother: 2\n")
+    (tmp_path / "mine.yaml").write_text(
+        "# What it is.\ndefaults: [_base]\nlow: 3\n\n# above\nhigh: 4.0e6  # s\n  # goes on\n"
+        "inner:   # of both\n  a: [x,\n      y]   # two\n  b: {c: 1}\n"
+        "list:  # items\n  - {d: 1}   # one\n  - e: [2]\n    f: 3\n"
+    )
+    keys = {key.name: (key.default, key.comment) for key in file_keys(tmp_path / "mine.yaml").values()}
+    assert keys == {
+        "low": ("3", "m"),
+        "other": ("2", ""),
+        "high": ("4.0e6", "above s goes on"),
+        "inner.a": ("[x, y]", "two (of both)"),
+        "inner.b": ("{c: 1}", ""),
+        "list": ("[{d: 1}, {e: [2], f: 3}]", "items one"),
+    }
+    assert heading(tmp_path / "mine.yaml") == "What it is."
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("evalute",), "there is no command 'evalute'; did you mean evaluate? (train, evaluate, play,"),
+        (("train", "num_world=512"), "there is no key 'num_world'; did you mean num_worlds?"),
+        (("train", "algo.gama=0.9"), "there is no key 'algo.gama'; did you mean gamma?"),
+        (("train", "+serve.speed=3"), "serve.speed"),
+        (("train", "experiment=papper"), "experiment/papper does not exist; did you mean paper? (experiment: "),
+        (("train", "ball=plastic"), "ball/plastic does not exist (ball: paper, rubber, standard, venue)"),
+        (("train", "engine=mjx"), "(engine: auto, mjwarp, native)"),
+        (("train", "--minutes", "3"), "write minutes=3"),
+        (("train", "--num_worlds=512"), "write num_worlds=512"),
+        (("train", "minutes", "=", "3"), "write minutes=3, without spaces"),
+        (("train", "minutes=", "3"), "write minutes=3, without spaces"),
+        (("train", "minutes", "=3"), "write minutes=3, without spaces"),
+        (("train", "minutes"), "'minutes' is no key=value"),
+        (("train", "serve.vx=-5"), "'serve.vx': needs a list"),
+        (("train", "run_dir=runs/x"), "run_dir= is now out="),
+        (("ablate", "run_dir=runs/x"), "run_dir= is now out="),
+        (("ablate", "experiment=paper"), "experiments= names them"),
+        (("evaluate", "policy=zero", "serve=short"), "rows= names the serve ranges"),
+        (("evaluate", "policy=zero", "observation=memory"), "observation= is of pace train"),
+        (("evaluate", "policy=zero", "serve.speed=3", "rows=[short]"), "speed"),
+        (("evaluate", "policy=zero", "rows=[lob]"), "serve/lob does not exist (serve: long, mid_long"),
+        (("evaluate", "policy=zero", "row=[short]"), "did you mean rows?"),
+        (("play", "a", "overrides=[ball=paper]"), "there is no key 'overrides'"),
+        (("play", "a", "rows=[short]"), "there is no key 'rows'"),
+        (("play", "a", "--video"), "--video needs a value"),
+        (("export", "a", "ball=paper"), "ball= is of pace train, and changes nothing in pace export"),
+        (("bench", "samples=1e6"), "bench.train_updates"),
+        (("bench", "resume=runs/x"), "resume= is of pace train"),
+        (("predictor", "init_from=runs/x"), "init_from= is of pace train"),
+        (("studies", "parities"), "there is no study 'parities'; did you mean parity?"),
+        (("studies",), "which study? reaction, parity,"),
+        (("studies", "--worlds", "3"), "write worlds=3"),
+        (("keep", "runs/x"), "where to?"),
+        (("train", "--help", "bal"), "pace train takes no group bal; did you mean ball?"),
+        (("train", "--help", "ball=papr"), "did you mean paper?"),
+    ],
+)
+def test_what_is_written_wrong_ends_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], arguments: tuple[str, ...], words: str
+) -> None:
+    assert words in error_line(monkeypatch, capfd, *arguments)
+
+
+def test_a_renamed_choice_ends_in_one_line(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setitem(names.RENAMED_CHOICES, "experiment=grand", "experiment=paper")
+    monkeypatch.setitem(names.RENAMED_CHOICES, "ball=old", "ball=paper")
+    assert "experiment=grand is now experiment=paper" in error_line(monkeypatch, capfd, "train", "experiment=grand")
+    for command in ("play", "evaluate"):
+        assert "ball=old is now ball=paper" in error_line(monkeypatch, capfd, command, "a", "ball=old")
+
+
+def test_a_policy_that_is_not_there_names_those_that_are(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for command in ("evaluate", "play", "export"):
+        assert run(monkeypatch, command, "pretrained/pase") == 1
+        error = capsys.readouterr().err.splitlines()[-1]
+        known = ", ".join(sorted(path.name for path in Path("pretrained").glob("*/")))
+        assert error.endswith(f"pretrained/pase does not exist; did you mean pace? (pretrained: {known})")
+
+
+def test_a_command_is_its_module(monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[tuple[str, list[str]]] = []
+
+    def run_module(module: str, **_: object) -> None:
+        started.append((module, sys.argv[1:]))
+
+    monkeypatch.setattr(runpy, "run_module", run_module)
+    for name in COMMANDS:
+        assert run(monkeypatch, name, "a", "b=1") == 0
+    assert started == [(command.module, ["a", "b=1"]) for command in COMMANDS.values()]
+
+
+@pytest.mark.parametrize("old", sorted(MOVED))
+def test_old_commands_name_the_new_one(old: str) -> None:
+    done = subprocess.run([sys.executable, "-m", old, "runs/x"], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    lines = [line for line in done.stderr.splitlines() if not line.startswith("Warp")]
+    assert lines == [f"error: python -m {old} is now: pace {MOVED[old]}"]
+    assert MOVED[old] in COMMANDS
+    with pytest.raises(ImportError, match=f"pace {MOVED[old]}"):
+        __import__(old)
+
+
+def test_pace_is_a_console_script() -> None:
+    project = tomllib.loads(Path("pyproject.toml").read_text())["project"]
+    assert project["scripts"] == {"pace": "pace.__main__:main"}

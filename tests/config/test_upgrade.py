@@ -1,0 +1,82 @@
+"""What older versions saved: configurations and training state in today's form, from the files of the repository."""
+
+from __future__ import annotations
+
+import json
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pace.config import names, upgrade
+from pace.config.base import ConfigError, parse, to_dict
+from pace.config.overrides import override_task
+from pace.config.training import TrainConfig, load_train_config
+from pace.config.upgrade import FORMAT, upgrade_config, upgrade_state
+from pace.rl.policies import load_policy
+from pace.runs.checkpoint import META, load_checkpoint, read_meta
+from pace.runs.queue import Run, check_settings
+from tests.helpers.saved import save_run
+
+
+def old_config(**changes: Any) -> dict[str, Any]:
+    """The default configuration as commit 43400ac saved it."""
+    config = to_dict(load_train_config())
+    del config["out"]
+    return config | {"run_dir": "runs/old"} | changes
+
+
+def test_run_dir_is_out() -> None:
+    old = old_config()
+    before = deepcopy(old)
+    new = upgrade_config(old, 1)
+    assert (new["out"], "run_dir" in new) == ("runs/old", False)
+    assert parse(new, TrainConfig).out == "runs/old"
+    assert old == before
+    assert upgrade_config(new, FORMAT) == new
+
+
+def test_renamed_choices_are_renamed_in_what_was_saved(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(names.RENAMED_CHOICES, "sensing=blurred", "sensing=wide")
+    old = old_config(curriculum=[{"samples": 1e6, "task": ["sensing=blurred", "reward.scale=0.3"]}])
+    old["sensing"] = old["sensing"] | {"name": "blurred"}
+    new = upgrade_config(old, 1)
+    assert new["curriculum"][0]["task"] == ["sensing=wide", "reward.scale=0.3"]
+    assert (new["sensing"]["name"], new["ball"]["name"]) == ("wide", "rubber")
+    with pytest.raises(ConfigError, match="sensing=blurred is now sensing=wide"):
+        override_task(load_train_config(), ["sensing=blurred"])
+    with pytest.raises(ConfigError, match="sensing=blurred is now sensing=wide"):
+        load_train_config(["sensing=blurred"])
+
+
+def test_upgrades_run_in_order_and_only_where_they_are_due(monkeypatch: pytest.MonkeyPatch) -> None:
+    steps = [(number, lambda state, number=number: state["seen"].append(number)) for number in (3, 2, 4)]
+    monkeypatch.setattr(upgrade, "STATE_UPGRADES", steps)
+    assert upgrade_state({"seen": []}, 2) == {"seen": [3, 4]}
+    assert upgrade_state({"seen": []}, 1) == {"seen": [2, 3, 4]}
+    assert upgrade_state({"seen": []}, 4) == {"seen": []}
+
+
+@pytest.mark.parametrize("policy", sorted(path.name for path in Path("pretrained").glob("*/")))
+def test_published_policies_are_read(policy: str) -> None:
+    folder = Path("pretrained", policy)
+    if json.loads((folder / META).read_text())["format"] == 1:
+        assert "run_dir" in (folder / META).read_text()
+    config = read_meta(folder)["config"]
+    assert (config["out"], "run_dir" in config) == (None, False)
+    assert load_policy(folder).config.out is None
+
+
+def test_a_saved_file_says_its_format(tmp_path: Path) -> None:
+    folder = save_run(tmp_path) / "checkpoints" / "update_00000003"
+    assert json.loads((folder / META).read_text())["format"] == FORMAT
+
+
+def test_an_old_checkpoint_is_upgraded_wherever_it_is_read(tmp_path: Path) -> None:
+    folder = save_run(tmp_path) / "checkpoints" / "update_00000003"
+    meta = json.loads((folder / META).read_text())
+    meta |= {"format": 1, "config": old_config()}
+    (folder / META).write_text(json.dumps(meta))
+    assert load_checkpoint(tmp_path).config["out"] == "runs/old"
+    check_settings(Run(tmp_path, (), 100.0))  # the same settings, but for the folder
