@@ -20,6 +20,8 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
+from pace.config.renamed import with_current_names
+
 FORMAT = 1
 META, WEIGHTS, TRAINING = "checkpoint.json", "weights.safetensors", "training.safetensors"
 FOLDER = "checkpoints"
@@ -147,6 +149,8 @@ def load_checkpoint(path: str | Path, weights_only: bool = False) -> Checkpoint:
 def read_meta(folder: Path) -> dict[str, Any]:
     """What ``checkpoint.json`` of a checkpoint holds: config, counters and places of the tensors, which stay unread.
 
+    Choices that were renamed since then have their current names in the config.
+
     Errors: :class:`CheckpointError` for a file that cannot be read, has another format number or lacks a part.
     """
     file = folder / META
@@ -161,7 +165,7 @@ def read_meta(folder: Path) -> dict[str, Any]:
     missing = [key for key in ("config", "counters", "weights", "training") if key not in meta]
     if missing:
         raise CheckpointError(f"{file} lacks {', '.join(missing)}")
-    return meta
+    return meta | {"config": with_current_names(meta["config"])}
 
 
 def _read_tensors(file: Path) -> dict[str, Tensor]:

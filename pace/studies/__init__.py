@@ -1,1 +1,1 @@
-"""Studies of the simulation for ``docs/engines.md`` and ``docs/physics.md``: engines, step sizes, paddle reaction."""
+"""Studies of the simulation for ``docs/results``: engines, step sizes, paddle reaction."""

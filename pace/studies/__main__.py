@@ -1,9 +1,8 @@
 """``python -m pace.studies``: engines against each other, step sizes, solver settings, paddle reaction, motors,
-what a predictor can know, how a policy stands, whether it finds out its paddle, what it makes of its sensors, and what
-rounding to bf16 does to its learning (extra ``dev``).
+what a predictor can know, how a policy stands, whether it finds out its paddle, what it makes of its sensors, what
+rounding to bf16 does to its learning, and the curves of the recipes that were tried (extra ``dev``).
 
-Prints the tables of ``docs/engines.md``, ``docs/physics.md``, ``docs/predictor.md`` and ``docs/campaign.md`` and writes
-their figures.
+Prints the tables of the pages in ``docs/results`` and writes their figures.
 """
 
 from __future__ import annotations
@@ -19,10 +18,23 @@ from matplotlib.figure import Figure
 from pace.config.base import ConfigError
 from pace.rl.policies import load_predictor
 from pace.runs.checkpoint import CheckpointError
-from pace.studies import adaptation, motors, parity, posture, predictor, reaction, rounding, senses, steps
+from pace.studies import (
+    adaptation,
+    learning_curves,
+    motors,
+    parity,
+    posture,
+    predictor,
+    reaction,
+    recipe,
+    rounding,
+    senses,
+    steps,
+)
 from pace.studies.swings import Swings, policy_swings, random_swings
 
-CAMPAIGN = Path("pretrained/campaign")
+GENERALIST = Path("pretrained/campaign")
+RESULTS = Path("docs/results")
 
 
 def _save(out: Path, name: str, size: tuple[float, float], draw: Callable[[Figure], None]) -> None:
@@ -82,11 +94,11 @@ def study_adaptation(options: argparse.Namespace) -> None:
 
 
 def study_senses(options: argparse.Namespace) -> None:
-    print(senses.table(senses.sense(options.run or CAMPAIGN, options.worlds)))
+    print(senses.table(senses.sense(options.run or GENERALIST, options.worlds)))
 
 
 def study_rounding(options: argparse.Namespace) -> None:
-    print(rounding.table(rounding.measure(options.run or CAMPAIGN, options.worlds)))
+    print(rounding.table(rounding.measure(options.run or GENERALIST, options.worlds)))
 
 
 def _policies(options: argparse.Namespace) -> list[Path]:
@@ -105,6 +117,21 @@ def study_predictor(options: argparse.Namespace) -> None:
     _save(options.out, "predictor", (9.5, 3.6), lambda figure: predictor.draw(found, figure))
 
 
+def study_recipe(options: argparse.Namespace) -> None:
+    runs = recipe.listed(RESULTS / "recipe")
+    if options.run:
+        recipe.take_over(runs, options.run)
+    curves = {tried: tried.curve() for tried in runs}
+    print(recipe.table(curves))
+    print(f"wrote {recipe.draw(curves, options.out / 'recipe.png')}")
+
+
+def study_learning(options: argparse.Namespace) -> None:
+    curves = learning_curves.read(RESULTS)
+    print(learning_curves.table(curves))
+    print(f"wrote {learning_curves.draw(curves, options.out / 'learning.png')}")
+
+
 STUDIES = {
     "reaction": study_reaction,
     "parity": study_parity,
@@ -116,6 +143,8 @@ STUDIES = {
     "adaptation": study_adaptation,
     "senses": study_senses,
     "rounding": study_rounding,
+    "recipe": study_recipe,
+    "learning": study_learning,
 }
 
 
@@ -124,14 +153,13 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m pace.studies", description=__doc__)
     parser.add_argument("studies", nargs="*", choices=[*STUDIES, []], help="which; none: all")
     parser.add_argument("--worlds", type=int, default=16, help="worlds of each case")
-    parser.add_argument(
-        "--run", type=Path, help="run folder or checkpoint to study; none: random swings, or pretrained/*"
-    )
+    which = "run folder or checkpoint to study; none: random swings, or pretrained/*; recipe: a folder of run folders"
+    parser.add_argument("--run", type=Path, help=f"{which} whose metrics are taken over first")
     parser.add_argument("--serves", type=int, default=128, help="motors, posture, predictor: serves of each case")
     parser.add_argument("--cases", nargs="*", choices=list(predictor.CASES), help="predictor: which; none: all")
     beside = "predictor: runs or checkpoints to measure beside the bounds"
     parser.add_argument("--predictors", nargs="*", type=Path, default=[], help=beside)
-    parser.add_argument("--out", type=Path, default=Path("docs/figures"), help="folder of the figures")
+    parser.add_argument("--out", type=Path, default=RESULTS / "figures", help="folder of the figures")
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
     for name in options.studies or STUDIES:

@@ -1,4 +1,4 @@
-"""``python -m pace.studies.ball``: the figures of ``docs/physics.md`` and the numbers it quotes (extra ``dev``)."""
+"""``python -m pace.studies.ball``: figures and numbers of ``docs/results/physics.md`` (extra ``dev``)."""
 
 from __future__ import annotations
 
@@ -219,7 +219,7 @@ def print_speed(num_worlds: int = 1024) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m pace.studies.ball", description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("docs/figures"), help="folder of the figures")
+    parser.add_argument("--out", type=Path, default=Path("docs/results/figures"), help="folder of the figures")
     out: Path = parser.parse_args().out
     out.mkdir(parents=True, exist_ok=True)
     drawings = {"flight_error": draw_flight_errors, "rebound": draw_rebound, "presets": draw_presets}
