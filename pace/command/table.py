@@ -109,7 +109,7 @@ COMMANDS = {
         examples=(
             "out=runs/ablation jobs=2",
             "experiments=[full,no_predictor] seeds=[7] samples=4e6 num_worlds=512",
-            "train=false out=docs/ablation     # table and figure again, from the CSVs",
+            "train=false out=docs/results/recipe     # table and figure again, from the CSVs",
         ),
         groups=tuple(group for group in TRAIN_GROUPS if group != "experiment"),
         training_keys=("num_worlds", "processes", "device", "curriculum", "checkpoint_minutes", "tensorboard"),
@@ -141,7 +141,7 @@ COMMANDS = {
         extra="dev",
         config="validate",
         summary="the ball's flight and rebounds against independent solutions (extra dev)",
-        about="Prints the numbers of docs/physics.md and draws its figures.",
+        about="Prints the numbers of docs/results/physics.md and draws its figures.",
     ),
     "predictor": Command(
         module="pace.predictor",

@@ -11,18 +11,39 @@ RENAMED_KEYS = {"run_dir": "out"}
 #: Old choice of a group -> new choice, such as ``"experiment=old": "experiment=new"``. Command lines,
 #: ``load_train_config`` and ``override_task`` refuse an old one and name the new one; saved configurations are upgraded
 #: (``pace.config.upgrade``).
-RENAMED_CHOICES: dict[str, str] = {}
+#: ``pace`` meant "the default" in four groups, and ``full`` three things.
+RENAMED_CHOICES = {
+    "reward=pace": "reward=intercept",
+    "randomization=full": "randomization=moderate",
+    "observation=pace": "observation=paddle_pose",
+    "algo=pace": "algo=small_batch",
+    "predictor=pace": "predictor=last_five",
+    "bench=full": "bench=all",
+    "experiment=campaign": "experiment=generalist",
+    "experiment=full": "experiment=ablation/baseline",
+    "experiment=no_predictor": "experiment=ablation/no_predictor",
+    "experiment=no_hit_guidance": "experiment=ablation/no_hit_guidance",
+    "experiment=no_return_guidance": "experiment=ablation/no_return_guidance",
+    "experiment=paper_reward": "experiment=ablation/paper_reward",
+}
 
 
 def choices(group: str) -> list[str]:
-    """Choices of ``group``: the names of configs/<group>/*.yaml, but for parts of others, which begin with ``_``."""
-    return sorted(file.stem for file in (config_dir() / group).glob("*.yaml") if not file.stem.startswith("_"))
+    """Choices of ``group``: the files of configs/<group>/ and its folders, but for parts of others, named ``_...``."""
+    folder = config_dir() / group
+    files = [file.relative_to(folder).with_suffix("") for file in folder.rglob("*.yaml")]
+    return sorted(file.as_posix() for file in files if not file.name.startswith("_"))
 
 
 def split_override(override: str) -> tuple[str, str]:
     """Key and value of a Hydra override: ``+ball=a`` -> ``("ball", "a")``, ``~ball`` -> ``("ball", "")``."""
     key, _, value = override.lstrip("+~").partition("=")
     return key.strip(), value.strip().strip("'\"")
+
+
+def current_override(override: str) -> str:
+    """``override`` with the current name of the choice that it makes; others as they are."""
+    return RENAMED_CHOICES.get(override, override)
 
 
 def check_renamed(overrides: Iterable[str]) -> None:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from copy import deepcopy
 from typing import Any
 
-from pace.config.names import RENAMED_CHOICES
+from pace.config.names import current_override
 
 #: Of what this version writes. 1 is that of version 0.1.0 up to commit 43400ac.
 FORMAT = 2
@@ -30,14 +30,30 @@ def rename_choices(config: Saved) -> None:
     """Choices, in each group's ``name`` and in the stages of the curriculum, are called as in ``RENAMED_CHOICES``."""
     for group, part in config.items():
         if isinstance(part, dict) and "name" in part:
-            new = RENAMED_CHOICES.get(f"{group}={part['name']}", f"{group}={part['name']}")
-            part["name"] = new.partition("=")[2]
+            part["name"] = current_override(f"{group}={part['name']}").partition("=")[2]
     for stage in config.get("curriculum") or []:
-        stage["task"] = [RENAMED_CHOICES.get(override, override) for override in stage["task"]]
+        stage["task"] = [current_override(override) for override in stage["task"]]
+
+
+def name_the_robots_parts(config: Saved) -> None:
+    """The MJCF and the names of the robot's parts, once constants of the code: those of the T1 with its paddle."""
+    config.get("robot", {}).update(
+        model="t1_paddle.xml",
+        paddle_site="paddle",
+        foot_sites=["left_foot", "right_foot"],
+        head_site="head",
+        arm=["Right_Shoulder", "Right_Elbow"],
+        groups={
+            "ankles": ["Ankle"],
+            "hip_waist_left_arm": ["Left_Shoulder_Pitch", "Left_Elbow", "Hip_Roll", "Hip_Yaw", "Waist"],
+            "left_shoulder_roll": ["Left_Shoulder_Roll"],
+            "right_arm": ["Right_Shoulder", "Right_Elbow"],
+        },
+    )
 
 
 #: (format that it makes, function of the configuration).
-CONFIG_UPGRADES: list[Upgrade] = [(2, name_the_folder_out), (2, rename_choices)]
+CONFIG_UPGRADES: list[Upgrade] = [(2, name_the_folder_out), (2, rename_choices), (2, name_the_robots_parts)]
 #: (format that it makes, function of the training state: ``ppo``, ``regression`` and ``processes``, each of them with
 #: ``env`` and ``random``). Tensors are in their places.
 STATE_UPGRADES: list[Upgrade] = []
