@@ -18,8 +18,9 @@ SCHEMAS = {"train": TrainConfig, "bench": BenchConfig}
 
 def choices() -> list[tuple[str, str]]:
     """Every (group, choice) under configs/; files that begin with _ are parts of others."""
-    files = sorted(config_dir().glob("*/*.yaml"))
-    return [(f.parent.name, f.stem) for f in files if not f.stem.startswith("_")]
+    files = sorted(config_dir().glob("*/**/*.yaml"))
+    parts = [f.relative_to(config_dir()).with_suffix("").parts for f in files if not f.stem.startswith("_")]
+    return [(group, "/".join(choice)) for group, *choice in parts]
 
 
 @pytest.mark.parametrize(("group", "choice"), choices())
@@ -58,7 +59,7 @@ def test_paper_ball_has_the_fitted_drag() -> None:
 
 
 def test_default_reward_is_the_paper_reward_with_its_changes() -> None:
-    paper, ours = (load_train_config([f"reward={name}"]).reward for name in ("paper", "pace"))
+    paper, ours = (load_train_config([f"reward={name}"]).reward for name in ("paper", "intercept"))
     assert set(ours.terms) == set(paper.terms) | {"arrival", "ready_stance", "return_velocity"}
     changed = {name for name in paper.terms if paper.terms[name] != ours.terms[name]}
     assert changed == {"paddle_to_target", "success"}

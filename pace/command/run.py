@@ -51,7 +51,7 @@ def run_command(name: str, load: Callable[[], Work]) -> int:
 def _topic(arguments: Sequence[str]) -> str:
     """The group that stands behind ``--help``, if one does; a path there is the RUN of the command."""
     index = min(arguments.index(flag) for flag in ("-h", "--help") if flag in arguments)
-    return next((argument for argument in arguments[index + 1 :] if re.fullmatch(r"\w+(=\w+)?", argument)), "")
+    return next((argument for argument in arguments[index + 1 :] if re.fullmatch(r"\w+(=[\w/]+)?", argument)), "")
 
 
 def _run_hydra(command: Command, load: Callable[[], Work]) -> int:

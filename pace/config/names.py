@@ -1,22 +1,23 @@
-"""Names in ``configs/``: the choices of a group, and old names with their new ones."""
+"""Names in ``configs/``: the choices of a group, and what is said of a wrong or an old one."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
 from pace.config.base import ConfigError, config_dir, meant
+from pace.config.renamed import renamed_choice
 
 #: Old key -> new key, for every command.
 RENAMED_KEYS = {"run_dir": "out"}
-#: Old choice of a group -> new choice, such as ``"experiment=old": "experiment=new"``. Command lines,
-#: ``load_train_config`` and ``override_task`` refuse an old one and name the new one; saved configurations are upgraded
-#: (``pace.config.upgrade``).
-RENAMED_CHOICES: dict[str, str] = {}
 
 
 def choices(group: str) -> list[str]:
-    """Choices of ``group``: the names of configs/<group>/*.yaml, but for parts of others, which begin with ``_``."""
-    return sorted(file.stem for file in (config_dir() / group).glob("*.yaml") if not file.stem.startswith("_"))
+    """Choices of ``group``: the files below configs/<group>, but for parts of others, which begin with ``_``."""
+    folder = config_dir() / group
+    found = [file.relative_to(folder).with_suffix("").as_posix() for file in folder.rglob("*.yaml")]
+    return sorted(
+        (name for name in found if not name.split("/")[-1].startswith("_")), key=lambda name: (name.count("/"), name)
+    )
 
 
 def split_override(override: str) -> tuple[str, str]:
@@ -32,9 +33,9 @@ def check_renamed(overrides: Iterable[str]) -> None:
         if key in RENAMED_KEYS:
             raise ConfigError(f"{key}= is now {RENAMED_KEYS[key]}=")
         for choice in value.strip("[]").split(","):  # of a sweep (-m), or of several experiments
-            new = RENAMED_CHOICES.get(f"{key}={choice.strip()}")
-            if new is not None:
-                raise ConfigError(f"{key}={choice.strip()} is now {new}")
+            new = renamed_choice(key, choice.strip())
+            if new != choice.strip():
+                raise ConfigError(f"{key}={choice.strip()} is now {key}={new}")
 
 
 def check_choice(group: str, choice: str) -> None:

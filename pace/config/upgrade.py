@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from copy import deepcopy
 from typing import Any
 
-from pace.config.names import RENAMED_CHOICES
+from pace.config.renamed import with_current_names
 
 #: Of what this version writes. 1 is that of version 0.1.0 up to commit 43400ac.
 FORMAT = 2
@@ -27,13 +27,8 @@ def name_the_folder_out(config: Saved) -> None:
 
 
 def rename_choices(config: Saved) -> None:
-    """Choices, in each group's ``name`` and in the stages of the curriculum, are called as in ``RENAMED_CHOICES``."""
-    for group, part in config.items():
-        if isinstance(part, dict) and "name" in part:
-            new = RENAMED_CHOICES.get(f"{group}={part['name']}", f"{group}={part['name']}")
-            part["name"] = new.partition("=")[2]
-    for stage in config.get("curriculum") or []:
-        stage["task"] = [RENAMED_CHOICES.get(override, override) for override in stage["task"]]
+    """Choices, in each group's ``name`` and in the stages of the curriculum, have their current names."""
+    config |= with_current_names(config)
 
 
 #: (format that it makes, function of the configuration).

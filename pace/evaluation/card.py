@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from pace.config.renamed import current_override
 from pace.evaluation.report import markdown_table
 from pace.rl.policies import saved_config
 from pace.runs.checkpoint import load_checkpoint
@@ -49,7 +50,7 @@ def _facts(folder: Path, versions: Mapping[str, Any]) -> str:
 
 
 def _evaluation(folder: Path, found: Mapping[str, Any]) -> str:
-    overrides = [text for text in found["overrides"] if not text.startswith(MACHINE)]
+    overrides = [current_override(text) for text in found["overrides"] if not text.startswith(MACHINE)]
     fixed = [f"{key}={found[key]}" for key in ("physics_dt", "num_worlds", "warmup_serves", "seed")]
     serves = f"serves={min(row['serves'] for row in found['rows'])}"
     command = " ".join(["python -m pace.evaluation", f"pretrained/{folder.name}", *fixed, serves, *overrides])

@@ -25,7 +25,7 @@ from pace.rl.policies import TaskPolicy
 
 JSON, MAP = "sweep.json", "sweep.png"
 SERVES_PER_WORLD = 4  # counted, in a cell: more waste less on those that are not, and fill the cores less
-SLOWNESS = 10.0  # times that mjwarp takes on a CPU (docs/speed.md), for the time that is left
+SLOWNESS = 10.0  # times that mjwarp takes on a CPU (docs/results/speed.md), for the time that is left
 Tables = dict[str, list[dict[str, Any]]]  # summaries of a cell's rows, by its key
 LABELS = {"noise": "sensing noise", "trunk_mass": "trunk mass", "gain": "joint gains"}
 

@@ -64,8 +64,13 @@ def planned_runs(config: AblateConfig) -> list[Run]:
 
 
 def run_name(experiment: str, seed: int) -> str:
-    """Name of a run's folder and of its CSV."""
-    return f"{experiment}_seed{seed}"
+    """Name of a run's folder and of its CSV: ``ablation/baseline`` with seed 1 is ``baseline_seed1``."""
+    return f"{short_name(experiment)}_seed{seed}"
+
+
+def short_name(experiment: str) -> str:
+    """Name of an experiment without the folder that it lies in."""
+    return experiment.rpartition("/")[2]
 
 
 def train(config: AblateConfig, out: Path) -> Mapping[str, str]:
@@ -110,7 +115,9 @@ def summary(curves: Curves) -> str:
     rows = []
     for name, seeds in curves.items():
         there = [at_end(seeds, rate, end) for rate in SHOWN_RATES]
-        rows.append([f"`{name}`", *(needed(seeds, milestone) for milestone in reached), *there, speed(seeds)])
+        rows.append(
+            [f"`{short_name(name)}`", *(needed(seeds, milestone) for milestone in reached), *there, speed(seeds)]
+        )
     return markdown(head, rows)
 
 
@@ -151,7 +158,7 @@ def draw(curves: Curves, file: Path) -> Path:
     figure = Figure(figsize=(11, 4.2), layout="constrained")
     for axes, rate in zip(figure.subplots(1, 2), ("hits", "returns"), strict=True):
         for number, (name, seeds) in enumerate(curves.items()):
-            _draw_experiment(axes, number, name.replace("_", " "), seeds, rate)
+            _draw_experiment(axes, number, short_name(name).replace("_", " "), seeds, rate)
         axes.set(xlabel="control steps, millions", ylabel=f"{rate}, % of serves")
         axes.set_ylim(bottom=0)
         axes.grid(alpha=0.3)

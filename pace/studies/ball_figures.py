@@ -1,4 +1,4 @@
-"""The ball against independent solutions: the figures of ``docs/physics.md`` and the numbers it quotes."""
+"""The ball against independent solutions: the figures of ``docs/results/physics.md`` and the numbers it quotes."""
 
 from __future__ import annotations
 

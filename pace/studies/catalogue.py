@@ -1,8 +1,8 @@
 """The studies by name: engines against each other, step sizes, solver settings, paddle reaction, motors, what a
-predictor can know, how a policy stands, whether it finds out its paddle, what it makes of its sensors, and what bf16
-rounding does to its learning.
+predictor can know, how a policy stands, whether it finds out its paddle, what it makes of its sensors, what bf16
+rounding does to its learning, and the curves of the recipes that were tried.
 
-They print the tables of the documentation and draw their figures.
+They print the tables of the pages in ``docs/results`` and draw their figures.
 """
 
 from __future__ import annotations
@@ -19,10 +19,23 @@ from pace.config.base import meant, parse, require
 from pace.config.commands import StudiesConfig
 from pace.rl.policies import load_predictor
 from pace.runs.run_folder import default_folder
-from pace.studies import adaptation, motors, parity, posture, predictor, reaction, rounding, senses, steps
+from pace.studies import (
+    adaptation,
+    learning_curves,
+    motors,
+    parity,
+    posture,
+    predictor,
+    reaction,
+    recipe,
+    rounding,
+    senses,
+    steps,
+)
 from pace.studies.swings import Swings, policy_swings, random_swings
 
-CAMPAIGN = Path("pretrained/campaign")
+GENERALIST = Path("pretrained/campaign")
+RESULTS = Path("docs/results")
 
 
 @dataclass(frozen=True)
@@ -41,7 +54,6 @@ def _save(out: Path, name: str, size: tuple[float, float], draw: Callable[[Figur
     with plt.rc_context({"axes.spines.top": False, "axes.spines.right": False, "font.size": 9}):
         figure = plt.figure(figsize=size, layout="constrained")
         draw(figure)
-        out.mkdir(parents=True, exist_ok=True)
         figure.savefig(out / f"{name}.png", dpi=90)
         plt.close(figure)
     print(f"wrote {out / name}.png")
@@ -95,11 +107,11 @@ def study_adaptation(options: Options) -> None:
 
 
 def study_senses(options: Options) -> None:
-    print(senses.table(senses.sense(options.run or CAMPAIGN, options.worlds)))
+    print(senses.table(senses.sense(options.run or GENERALIST, options.worlds)))
 
 
 def study_rounding(options: Options) -> None:
-    print(rounding.table(rounding.measure(options.run or CAMPAIGN, options.worlds)))
+    print(rounding.table(rounding.measure(options.run or GENERALIST, options.worlds)))
 
 
 def _policies(options: Options) -> list[Path]:
@@ -118,6 +130,21 @@ def study_predictor(options: Options) -> None:
     _save(options.out, "predictor", (9.5, 3.6), lambda figure: predictor.draw(found, figure))
 
 
+def study_recipe(options: Options) -> None:
+    runs = recipe.listed(RESULTS / "recipe")
+    if options.run:
+        recipe.take_over(runs, options.run)
+    curves = {tried: tried.curve() for tried in runs}
+    print(recipe.table(curves))
+    print(f"wrote {recipe.draw(curves, options.out / 'recipe.png')}")
+
+
+def study_learning(options: Options) -> None:
+    curves = learning_curves.read(RESULTS)
+    print(learning_curves.table(curves))
+    print(f"wrote {learning_curves.draw(curves, options.out / 'learning.png')}")
+
+
 STUDIES = {
     "reaction": study_reaction,
     "parity": study_parity,
@@ -129,6 +156,8 @@ STUDIES = {
     "adaptation": study_adaptation,
     "senses": study_senses,
     "rounding": study_rounding,
+    "recipe": study_recipe,
+    "learning": study_learning,
 }
 
 
@@ -151,6 +180,7 @@ def study_from_config(composed: DictConfig) -> None:
         predictors=[Path(path) for path in config.predictors],
         out=Path(config.out) if config.out else default_folder("studies"),
     )
+    options.out.mkdir(parents=True, exist_ok=True)
     for name in names:
         print(f"\n== {name}")
         STUDIES[name](options)

@@ -1,4 +1,4 @@
-"""Whether it looks like table tennis: steps, hops, leaning and touches of a policy, at the ball and between serves."""
+"""Qualitative behaviour of a policy: steps, hops, lean of the trunk and touches, at the ball and between serves."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ def measure(run: Path, worlds: int) -> Rounding:
 @torch.no_grad()
 def _states(policy: TaskPolicy, worlds: int) -> Tensor:
     """Observations (worlds, inputs) after ``STEPS`` control steps."""
-    env = policy.make_env(worlds, "cpu", SEED, [*ENDLESS, "randomization=full"])
+    env = policy.make_env(worlds, "cpu", SEED, [*ENDLESS, "randomization=moderate"])
     for _ in range(STEPS):
         env.advance(policy(env.policy_observation))
     return env.policy_observation

@@ -17,7 +17,7 @@ from pace.task.env import TableTennisEnv
 TIMES = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)  # s since the episode began
 SEED = 5
 #: The paper's noise, and delays that differ by 26 ms.
-TASK = ("sensing=paper", "sensing.mocap_delay=[0.004,0.030]", "randomization=full")
+TASK = ("sensing=paper", "sensing.mocap_delay=[0.004,0.030]", "randomization=moderate")
 COLUMNS = (
     "delay, ms", "gravity sensed, mrad", "estimated", "heading sensed, mrad", "estimated", "joints sensed, mrad",
     "estimated", "joints sensed, rad/s", "estimated", "paddle sensed, mm", "estimated",

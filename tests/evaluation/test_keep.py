@@ -54,14 +54,14 @@ def test_the_kept_policy_acts_like_the_run(
 def test_the_card_says_what_it_is_and_how_to_play_its_table(tmp_path: Path) -> None:
     run = save_run(tmp_path / "run")
     (tmp_path / "run" / "versions.json").write_text(
-        json.dumps({"command": ["train.py", "experiment=campaign"], "packages": {"torch": "2.13.0", "pace": None}})
+        json.dumps({"command": ["train.py", "experiment=generalist"], "packages": {"torch": "2.13.0", "pace": None}})
     )
     (tmp_path / "evaluation.json").write_text(json.dumps(EVALUATED))
     keep(run, tmp_path / "mine", tmp_path, "It limps.")
     text = (tmp_path / "mine" / "README.md").read_text()
     assert text.startswith("# mine\n")
     assert "`ball=rubber`" in text
-    assert "| last command | `python -m pace.rl.train experiment=campaign` |" in text
+    assert "| last command | `python -m pace.rl.train experiment=generalist` |" in text
     assert "| versions | torch 2.13.0 |" in text
     assert "\nIt limps.\n" in text
     command = "physics_dt=0.002 num_worlds=256 warmup_serves=2 seed=1 serves=5120 sensing=paper"

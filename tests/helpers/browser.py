@@ -1,6 +1,6 @@
 """A headless Chromium, driven over its DevTools socket: enough for a test of a page, and for a picture of it.
 
-python tests/rl/browser.py http://127.0.0.1:8080 docs/figures/play.png
+python tests/helpers/browser.py http://127.0.0.1:8080 docs/results/figures/play.png
 """
 
 from __future__ import annotations

@@ -128,7 +128,7 @@ def test_the_exported_step_is_the_kernels() -> None:
 
 def test_the_task_knows_its_orientation_and_paddle_better() -> None:
     error = {}
-    for name, observation in (("estimated", "memory"), ("sensed", "pace")):
+    for name, observation in (("estimated", "memory"), ("sensed", "paddle_pose")):
         env = make_env(64, "native", "cpu", overrides=[f"observation={observation}", "engine.threads=1"])
         for _ in range(30):
             env.advance(torch.zeros(64, 21))

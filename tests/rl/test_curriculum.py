@@ -40,8 +40,8 @@ def test_each_stage_changes_the_task_of_the_one_before() -> None:
     assert (third.sensing.name, third.ball.name, third.sensing.mocap_delay) == ("paper", "venue", [0.0, 0.05])
 
 
-def test_the_campaigns_stages_are_tasks() -> None:
-    tasks = stage_tasks(load_train_config(["experiment=campaign"]))
+def test_the_generalists_stages_are_tasks() -> None:
+    tasks = stage_tasks(load_train_config(["experiment=generalist"]))
     assert [task.reward.terms["ready_stance"].weight for task in tasks] == [0.0, *3 * [10.0]]
     assert [task.sensing.name for task in tasks] == ["paper", "paper", *2 * ["wide"]]
     assert [task.randomization.trunk_mass for task in tasks] == [*2 * [[-2.0, 2.0]], *2 * [[-4.0, 6.0]]]

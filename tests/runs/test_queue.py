@@ -112,13 +112,15 @@ def test_cores_are_shared_out() -> None:
 
 
 def test_a_run_of_other_settings_is_not_taken_up(tmp_path: Path) -> None:
-    run = Run(tmp_path / "full_seed1", ("experiment=full", "seed=1"), 100.0)
+    run = Run(tmp_path / "baseline_seed1", ("experiment=ablation/baseline", "seed=1"), 100.0)
     check_settings(run)  # nothing there yet
-    there = to_dict(load_train_config(["experiment=full", "seed=1", "minutes=0", "samples=50", "processes=2"]))
+    there = to_dict(
+        load_train_config(["experiment=ablation/baseline", "seed=1", "minutes=0", "samples=50", "processes=2"])
+    )
     checkpoint = run.folder / "checkpoints" / "update_00000001"
     checkpoint.mkdir(parents=True)
     meta = {"format": 1, "config": there, "counters": {"samples": 50}, "weights": {}, "training": None}
     (checkpoint / "checkpoint.json").write_text(json.dumps(meta))
     check_settings(run)  # limits and the number of processes are free
-    with pytest.raises(ConfigError, match=r"full_seed1 was trained with algo\.gamma 0\.98, and 0\.9 is asked for"):
+    with pytest.raises(ConfigError, match=r"baseline_seed1 was trained with algo\.gamma 0\.98, and 0\.9 is asked for"):
         check_settings(Run(run.folder, (*run.overrides, "algo.gamma=0.9"), 100.0))

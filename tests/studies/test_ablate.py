@@ -38,12 +38,12 @@ def ablate(monkeypatch: pytest.MonkeyPatch):
 
 @lru_cache
 def experiment(name: str) -> TrainConfig:
-    return load_train_config([f"experiment={name}"])
+    return load_train_config([f"experiment={name}" if name == "paper" else f"experiment=ablation/{name}"])
 
 
 def changed_parts(name: str) -> set[str]:
-    full, other = to_dict(experiment("full")), to_dict(experiment(name))
-    return {key for key in full if full[key] != other[key]} - {"name"}
+    baseline, other = to_dict(experiment("baseline")), to_dict(experiment(name))
+    return {key for key in baseline if baseline[key] != other[key]} - {"name"}
 
 
 @pytest.mark.parametrize(
@@ -54,28 +54,28 @@ def changed_parts(name: str) -> set[str]:
     ],
 )
 def test_guidance_is_taken_away_and_nothing_else(name: str, silenced: set[str]) -> None:
-    full, less = experiment("full").reward, experiment(name).reward
+    baseline, less = experiment("baseline").reward, experiment(name).reward
     assert changed_parts(name) == {"reward"}
     assert {term for term in less.terms if less.terms[term].weight == 0} == silenced
-    for term in set(full.terms) - silenced - {"success"}:
-        assert less.terms[term] == full.terms[term]
-    assert less.terms["success"].weight == full.terms["success"].weight
+    for term in set(baseline.terms) - silenced - {"success"}:
+        assert less.terms[term] == baseline.terms[term]
+    assert less.terms["success"].weight == baseline.terms["success"].weight
     at_hit = less.terms["success"].params["at_hit"]
-    assert at_hit == (0.0 if name == "no_return_guidance" else full.terms["success"].params["at_hit"])
+    assert at_hit == (0.0 if name == "no_return_guidance" else baseline.terms["success"].params["at_hit"])
 
 
 def test_without_a_predictor_the_actor_has_no_predicted_quantity() -> None:
     assert changed_parts("no_predictor") == {"predictor", "observation"}
-    full, less = experiment("full"), experiment("no_predictor")
+    baseline, less = experiment("baseline"), experiment("no_predictor")
     assert not less.predictor.enabled
     gone = {"predicted_apex", "predicted_base_shift", "predicted_time"}
-    assert less.observation.policy == [name for name in full.observation.policy if name not in gone]
-    assert less.observation.critic == full.observation.critic
+    assert less.observation.policy == [name for name in baseline.observation.policy if name not in gone]
+    assert less.observation.critic == baseline.observation.critic
 
 
 def test_paper_reward_is_that_of_the_paper_in_our_scale() -> None:
     assert changed_parts("paper_reward") == {"reward"}
-    ours, paper, mixed = experiment("full"), experiment("paper"), experiment("paper_reward")
+    ours, paper, mixed = experiment("baseline"), experiment("paper"), experiment("paper_reward")
     assert mixed.reward.terms == paper.reward.terms
     assert mixed.reward.scale == ours.reward.scale != paper.reward.scale
 
@@ -117,10 +117,17 @@ def test_seeds_are_compared_where_all_of_them_have_been() -> None:
 
 
 def test_every_experiment_gets_every_seed() -> None:
-    config = parse(compose("ablate", ["experiments=[full,paper_reward]", "seeds=[4,5]"]), AblateConfig)
+    config = parse(
+        compose("ablate", ["experiments=[ablation/baseline,ablation/paper_reward]", "seeds=[4,5]"]), AblateConfig
+    )
     runs = planned_runs(config)
-    assert [run.name for run in runs] == ["full_seed4", "paper_reward_seed4", "full_seed5", "paper_reward_seed5"]
-    assert runs[3].overrides == ("experiment=paper_reward", "seed=5")
+    assert [run.name for run in runs] == [
+        "baseline_seed4",
+        "paper_reward_seed4",
+        "baseline_seed5",
+        "paper_reward_seed5",
+    ]
+    assert runs[3].overrides == ("experiment=ablation/paper_reward", "seed=5")
     for wrong in ("seeds=[]", "seeds=[1,1]", "jobs=0", "samples=0", "experiments=[]", "figure=a.svg"):
         with pytest.raises(ConfigError):
             parse(compose("ablate", [wrong]), AblateConfig)
@@ -129,7 +136,7 @@ def test_every_experiment_gets_every_seed() -> None:
 def test_a_real_ablation_and_its_second_call(ablate, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     common = (
-        "experiments=[no_predictor,paper_reward]", "seeds=[3]", f"out={out}",
+        "experiments=[ablation/no_predictor,ablation/paper_reward]", "seeds=[3]", f"out={out}",
         f"window={UPDATE}", f"figure={FIGURE}", "progress=false", *TINY,
     )  # fmt: skip
     assert ablate(f"samples={2 * UPDATE}", "jobs=2", *common) == 0

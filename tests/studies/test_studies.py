@@ -1,4 +1,4 @@
-"""The studies: what they measure is what they say, the tolerances that docs/engines.md states, and their command."""
+"""The studies: what they measure, the tolerances that docs/results/engines.md states, and their command."""
 
 from __future__ import annotations
 

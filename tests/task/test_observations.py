@@ -35,7 +35,7 @@ IDLE = torch.tensor([-1.7, -0.3, 1.0])
 
 @pytest.mark.parametrize(
     ("overrides", "policy", "critic"),
-    [(("observation=paper",), 82, 93), (("observation=pace",), 90, 107), (("observation=memory",), 96, 110)],
+    [(("observation=paper",), 82, 93), (("observation=paddle_pose",), 90, 107), (("observation=memory",), 96, 110)],
 )
 def test_sizes(overrides: tuple[str, ...], policy: int, critic: int) -> None:
     names = config(*overrides).observation
@@ -58,7 +58,7 @@ def test_unknown_names_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"observation.critic: unknown name 'ball_colour'"):
         check_critic(["ball_colour"])
     with pytest.raises(ConfigError, match=r"add 'target_time' to predictor.outputs"):
-        check_policy(config("observation=pace").observation, config("predictor=paper").predictor)
+        check_policy(config("observation=paddle_pose").observation, config("predictor=paper").predictor)
     with pytest.raises(ConfigError, match=r"predictor.outputs"):
         predictor_slices(["apex", "spin"])
     with pytest.raises(ConfigError, match=r"predictor.outputs"):

@@ -13,12 +13,12 @@ from torch import Tensor
 
 from pace.config.base import ConfigError
 from pace.config.task import RewardConfig, RewardTerm
-from pace.config.training import load_train_config
 from pace.sim.ball.aero import GRAVITY
 from pace.sim.ball.ball import BallParams, BallSim
 from pace.task.rewards import TERMS, RewardFunction, RewardManager, paddle_speed
 from pace.task.state import JOINT_GROUPS, TaskState
 from tests.helpers.fakes import CPU, JOINT_NAMES, config, fake_state, set_events
+from tests.helpers.recipes import recipe
 
 PAPER_TASK = config("reward=paper")
 PAPER = PAPER_TASK.reward
@@ -201,7 +201,7 @@ def swung(arriving: Tensor, point: Tensor, speed: Tensor, normal: Tensor, params
 
 
 def test_a_perfect_swing_is_one_that_returns_the_ball() -> None:
-    reward = load_train_config(["experiment=swing"]).reward
+    reward = recipe("swing").reward
     state = fake_state()
     material = BallParams.from_config(config().ball)
     material = replace(material, paddle_friction=0.0, drag_coefficient=0.0, magnus_coefficient=0.0)

@@ -1,0 +1,29 @@
+"""The resolved recipes of ``docs/results/recipe``."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from pace.config.base import parse, to_dict
+from pace.config.renamed import with_current_names
+from pace.config.training import TrainConfig, load_train_config
+
+RESULTS = Path(__file__).resolve().parents[2] / "docs" / "results"
+FOLDER = RESULTS / "recipe"
+
+
+@lru_cache
+def recipe(name: str) -> TrainConfig:
+    """A resolved recipe; keys of a single run, such as ``seed`` and ``device``, are the defaults of today."""
+    return parse(to_dict(load_train_config()) | with_current_names(written(name)), TrainConfig)
+
+
+def written(name: str) -> dict[str, Any]:
+    """What the file of a recipe holds, without its list of defaults."""
+    plain = OmegaConf.to_container(OmegaConf.load(FOLDER / f"{name}.yaml"))
+    assert isinstance(plain, dict)
+    return {str(key): value for key, value in plain.items() if key != "defaults"}
