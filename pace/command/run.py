@@ -35,8 +35,7 @@ def run_command(name: str, load: Callable[[], Work]) -> int:
     """
     try:
         if {"-h", "--help"} & set(sys.argv[1:]):
-            print(command_help(name, _topic(sys.argv[1:])))
-            return 0
+            return show(command_help(name, _topic(sys.argv[1:])))
         sys.argv[1:] = prepare(name, sys.argv[1:])
     except ConfigError as error:
         return complain(str(error), EXIT_USAGE)
@@ -97,6 +96,15 @@ def explain(name: str, arguments: Sequence[str], error: Exception) -> str:
     parent, _, key = unknown[1].rpartition(".")
     there = OmegaConf.select(compose(command.config), parent) if parent else None
     return f"there is no key '{unknown[1]}'{meant(key, there or ())} (--help lists the keys)"
+
+
+def show(text: str) -> int:
+    """Print ``text``, to a reader that may leave before its end (``| head``); returns the exit status."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains when it ends
+    return 0
 
 
 def complain(message: str, status: int) -> int:
