@@ -19,6 +19,8 @@ from pace.config.names import choices
 from pace.config.renamed import RENAMED_CHOICES
 from pace.moved import MOVED
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*found in sys.modules")  # a command runs once for each process
+
 
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     """``pace ...`` in this process; returns its exit status."""
