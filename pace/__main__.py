@@ -9,7 +9,7 @@ import runpy
 import sys
 
 from pace.command.help import overview
-from pace.command.run import EXIT_USAGE, complain
+from pace.command.run import EXIT_USAGE, complain, show
 from pace.command.table import COMMANDS
 from pace.config.base import meant
 
@@ -18,8 +18,7 @@ def main() -> int:
     """Entry point; returns the exit status."""
     name = sys.argv[1] if len(sys.argv) > 1 else "--help"
     if name in ("-h", "--help", "help"):
-        print(overview())
-        return 0
+        return show(overview())
     if name not in COMMANDS:
         return complain(f"there is no command '{name}'{meant(name, COMMANDS)} ({', '.join(COMMANDS)})", EXIT_USAGE)
     sys.argv[:] = [f"pace {name}", *sys.argv[2:]]

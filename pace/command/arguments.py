@@ -124,6 +124,7 @@ def check_keys(name: str, command: Command, arguments: Sequence[str]) -> None:
     """Errors: :class:`ConfigError` for an argument whose key the command does not have, or would not look at."""
     own = {key.split(".")[0] for key in command_keys(command)}
     known = [*own, *command.groups, *command.training_keys]
+    more_groups = any(argument.startswith(("--config-dir", "-cd", "hydra.searchpath")) for argument in arguments)
     for argument in plain_overrides(arguments):
         key, _ = split_override(argument)
         root = key.replace("/", ".").replace("@", ".").split(".")[0]
@@ -131,7 +132,7 @@ def check_keys(name: str, command: Command, arguments: Sequence[str]) -> None:
             raise ConfigError(f"{key}= is no key of pace {name}: {command.refused[key]}")
         if "=" not in argument and not argument.startswith("~"):
             raise ConfigError(f"'{argument}' is no key=value (--help lists the keys)")
-        if root in (*known, "hydra"):
+        if root in (*known, "hydra") or (more_groups and argument.startswith("+")):
             continue
         raise ConfigError(_unknown(name, root, known))
 

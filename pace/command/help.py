@@ -12,7 +12,7 @@ from textwrap import fill
 from pace.command.keys import Key, file_keys, heading
 from pace.command.table import COMMANDS, Command
 from pace.config.base import ConfigError, config_dir, meant
-from pace.config.names import choices
+from pace.config.names import check_choice, choices
 
 WIDTH = 96
 COLUMN = 34  # where comments begin
@@ -105,12 +105,13 @@ def group_help(name: str, command: Command, group: str, choice: str = "") -> str
         known = ", ".join(command.groups) or "none"
         raise ConfigError(f"pace {name} takes no group {group}{meant(group, command.groups)} (groups: {known})")
     names = choices(group)
-    choice = choice or default_choices(command).get(group, "")
-    file = config_dir() / group / f"{choice if choice in names else names[0]}.yaml"
-    if choice not in (*names, "", "null"):
-        raise ConfigError(f"{group}/{choice} does not exist{meant(choice, names)} ({group}: {', '.join(names)})")
+    if choice:
+        check_choice(group, choice)
+    usual = default_choices(command).get(group, "")
+    choice = choice or (usual if usual in names else names[0])
+    file = config_dir() / group / f"{choice}.yaml"
     prefix = "" if group == "experiment" else f"{group}."
     keys = [Key(prefix + key.name, key.default, key.comment) for key in file_keys(file).values() if key.name != "name"]
-    head = f"{group}={file.stem}: {heading(file)}" if heading(file) else f"{group}={file.stem}"
+    head = f"{group}={choice}: {heading(file)}" if heading(file) else f"{group}={choice}"
     all_choices = fill(f"{group}: {', '.join(names)}", WIDTH)
     return f"{fill(head, WIDTH)}\n\n{key_table(keys)}\n\n{all_choices}"

@@ -35,8 +35,7 @@ def run_command(name: str, load: Callable[[], Work]) -> int:
     """
     try:
         if {"-h", "--help"} & set(sys.argv[1:]):
-            print(command_help(name, _topic(sys.argv[1:])))
-            return 0
+            return show(command_help(name, _topic(sys.argv[1:])))
         sys.argv[1:] = prepare(name, sys.argv[1:])
     except ConfigError as error:
         return complain(str(error), EXIT_USAGE)
@@ -51,7 +50,7 @@ def run_command(name: str, load: Callable[[], Work]) -> int:
 def _topic(arguments: Sequence[str]) -> str:
     """The group that stands behind ``--help``, if one does; a path there is the RUN of the command."""
     index = min(arguments.index(flag) for flag in ("-h", "--help") if flag in arguments)
-    return next((argument for argument in arguments[index + 1 :] if re.fullmatch(r"\w+(=\w+)?", argument)), "")
+    return next((argument for argument in arguments[index + 1 :] if re.fullmatch(r"\w+(=[\w/]+)?", argument)), "")
 
 
 def _run_hydra(command: Command, load: Callable[[], Work]) -> int:
@@ -97,6 +96,15 @@ def explain(name: str, arguments: Sequence[str], error: Exception) -> str:
     parent, _, key = unknown[1].rpartition(".")
     there = OmegaConf.select(compose(command.config), parent) if parent else None
     return f"there is no key '{unknown[1]}'{meant(key, there or ())} (--help lists the keys)"
+
+
+def show(text: str) -> int:
+    """Print ``text``, to a reader that may leave before its end (``| head``); returns the exit status."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains when it ends
+    return 0
 
 
 def complain(message: str, status: int) -> int:

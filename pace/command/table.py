@@ -108,7 +108,7 @@ COMMANDS = {
         "others. Keys and choices of the training change every run.",
         examples=(
             "out=runs/ablation jobs=2",
-            "experiments=[full,no_predictor] seeds=[7] samples=4e6 num_worlds=512",
+            "experiments=[ablation/baseline,paper] seeds=[7] samples=4e6 num_worlds=512",
             "train=false out=docs/results/recipe     # table and figure again, from the CSVs",
         ),
         groups=tuple(group for group in TRAIN_GROUPS if group != "experiment"),
@@ -164,7 +164,7 @@ COMMANDS = {
         summary="engines, step sizes, motors, what a predictor can know, ...: measured anew (extra dev)",
         usage="STUDY [STUDY ...] [key=value ...]",
         about="Prints the tables of the documentation and draws their figures. STUDY: reaction, parity, steps, solver, "
-        "motors, predictor, posture, adaptation, senses, rounding, or all.",
+        "motors, predictor, posture, adaptation, senses, rounding, recipe, learning, or all.",
         examples=("parity worlds=16", "steps solver run=pretrained/pace", "predictor serves=512 cases=[rubber]"),
         rest="studies",
     ),

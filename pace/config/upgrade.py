@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from copy import deepcopy
 from typing import Any
 
-from pace.config.names import current_override
+from pace.config.renamed import with_current_names
 
 #: Of what this version writes. 1 is that of version 0.1.0 up to commit 43400ac.
 FORMAT = 2
@@ -27,12 +27,8 @@ def name_the_folder_out(config: Saved) -> None:
 
 
 def rename_choices(config: Saved) -> None:
-    """Choices, in each group's ``name`` and in the stages of the curriculum, are called as in ``RENAMED_CHOICES``."""
-    for group, part in config.items():
-        if isinstance(part, dict) and "name" in part:
-            part["name"] = current_override(f"{group}={part['name']}").partition("=")[2]
-    for stage in config.get("curriculum") or []:
-        stage["task"] = [current_override(override) for override in stage["task"]]
+    """Choices, in each group's ``name`` and in the stages of the curriculum, have their current names."""
+    config |= with_current_names(config)
 
 
 def name_the_robots_parts(config: Saved) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pace.config.names import current_override
+from pace.config.renamed import current_override
 from pace.evaluation.report import markdown_table
 from pace.rl.policies import saved_config
 from pace.runs.checkpoint import load_checkpoint

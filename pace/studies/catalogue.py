@@ -2,7 +2,7 @@
 predictor can know, how a policy stands, whether it finds out its paddle, what it makes of its sensors, what bf16
 rounding does to its learning, and the curves of the recipes that were tried.
 
-They print the tables of the documentation and draw their figures.
+They print the tables of the pages in ``docs/results`` and draw their figures.
 """
 
 from __future__ import annotations
@@ -54,7 +54,6 @@ def _save(out: Path, name: str, size: tuple[float, float], draw: Callable[[Figur
     with plt.rc_context({"axes.spines.top": False, "axes.spines.right": False, "font.size": 9}):
         figure = plt.figure(figsize=size, layout="constrained")
         draw(figure)
-        out.mkdir(parents=True, exist_ok=True)
         figure.savefig(out / f"{name}.png", dpi=90)
         plt.close(figure)
     print(f"wrote {out / name}.png")
@@ -137,14 +136,12 @@ def study_recipe(options: Options) -> None:
         recipe.take_over(runs, options.run)
     curves = {tried: tried.curve() for tried in runs}
     print(recipe.table(curves))
-    options.out.mkdir(parents=True, exist_ok=True)
     print(f"wrote {recipe.draw(curves, options.out / 'recipe.png')}")
 
 
 def study_learning(options: Options) -> None:
     curves = learning_curves.read(RESULTS)
     print(learning_curves.table(curves))
-    options.out.mkdir(parents=True, exist_ok=True)
     print(f"wrote {learning_curves.draw(curves, options.out / 'learning.png')}")
 
 
@@ -183,6 +180,7 @@ def study_from_config(composed: DictConfig) -> None:
         predictors=[Path(path) for path in config.predictors],
         out=Path(config.out) if config.out else default_folder("studies"),
     )
+    options.out.mkdir(parents=True, exist_ok=True)
     for name in names:
         print(f"\n== {name}")
         STUDIES[name](options)

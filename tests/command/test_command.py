@@ -14,10 +14,12 @@ from pace.__main__ import main
 from pace.command.help import WIDTH, command_help, command_keys
 from pace.command.keys import file_keys, heading
 from pace.command.table import COMMANDS
-from pace.config import names
 from pace.config.base import compose, config_dir
 from pace.config.names import choices
+from pace.config.renamed import RENAMED_CHOICES
 from pace.moved import MOVED
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*found in sys.modules")  # a command runs once for each process
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
@@ -184,9 +186,12 @@ def test_what_is_written_wrong_ends_in_one_line(
 
 
 def test_a_renamed_choice_ends_in_one_line(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setitem(names.RENAMED_CHOICES, "experiment=grand", "experiment=paper")
-    monkeypatch.setitem(names.RENAMED_CHOICES, "ball=old", "ball=paper")
-    assert "experiment=grand is now experiment=paper" in error_line(monkeypatch, capfd, "train", "experiment=grand")
+    monkeypatch.setitem(RENAMED_CHOICES, "ball", {"old": "paper"})
+    for group, renamed in RENAMED_CHOICES.items():
+        command = "bench" if group == "bench" else "train"
+        for old, new in renamed.items():
+            words = f"{group}={old} is now {group}={new}"
+            assert error_line(monkeypatch, capfd, command, f"{group}={old}") == words
     for command in ("play", "evaluate"):
         assert "ball=old is now ball=paper" in error_line(monkeypatch, capfd, command, "a", "ball=old")
 

@@ -9,9 +9,10 @@ from typing import Any
 
 import pytest
 
-from pace.config import names, upgrade
+from pace.config import upgrade
 from pace.config.base import ConfigError, parse, to_dict
 from pace.config.overrides import override_task
+from pace.config.renamed import RENAMED_CHOICES
 from pace.config.training import TrainConfig, load_train_config
 from pace.config.upgrade import FORMAT, upgrade_config, upgrade_state
 from pace.rl.policies import load_policy
@@ -38,7 +39,7 @@ def test_run_dir_is_out() -> None:
 
 
 def test_renamed_choices_are_renamed_in_what_was_saved(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(names.RENAMED_CHOICES, "sensing=blurred", "sensing=wide")
+    monkeypatch.setitem(RENAMED_CHOICES, "sensing", {"blurred": "wide"})
     old = old_config(curriculum=[{"samples": 1e6, "task": ["sensing=blurred", "reward.scale=0.3"]}])
     old["sensing"] = old["sensing"] | {"name": "blurred"}
     new = upgrade_config(old, 1)
