@@ -33,7 +33,10 @@ def rename_choices(config: Saved) -> None:
 
 def name_the_robots_parts(config: Saved) -> None:
     """The MJCF and the names of the robot's parts, once constants of the code: those of the T1 with its paddle."""
-    config.get("robot", {}).update(
+    robot = config.get("robot")
+    if not isinstance(robot, dict):
+        return
+    robot.update(
         model="t1_paddle.xml",
         paddle_site="paddle",
         foot_sites=["left_foot", "right_foot"],
@@ -58,8 +61,9 @@ STATE_UPGRADES: list[Upgrade] = []
 def upgrade_config(config: Saved, version: int) -> Saved:
     """A saved configuration of the format ``version``, in the current format; ``config`` stays as it is."""
     changed = deepcopy(config)
-    for _, upgrade in _due(version, CONFIG_UPGRADES):
-        upgrade(changed)
+    if isinstance(changed, dict):  # anything else is left for the parser to complain about
+        for _, upgrade in _due(version, CONFIG_UPGRADES):
+            upgrade(changed)
     return changed
 
 
