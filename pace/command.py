@@ -11,6 +11,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
+from pace.config import plugins
 from pace.config.base import ConfigError, config_dir
 
 EXIT_USAGE = 2
@@ -31,7 +32,8 @@ def run_command(
 
     A wrong key, type or value gives one line and status 2; ``failures`` (expected errors of the task) one line and 1.
     The first argument without a key is the value of the key ``positional``. For a command that rebuilds a saved task,
-    ``task_groups`` are the parts of it that may change: see :func:`collect_overrides`.
+    ``task_groups`` are the parts of it that may change: see :func:`collect_overrides`. Modules that the user names,
+    in ``plugins`` or by an import path, are imported first: see :mod:`pace.config.plugins`.
     """
     if positional is not None:
         sys.argv[1:] = name_argument(sys.argv[1:], positional)
@@ -43,6 +45,8 @@ def run_command(
     def guarded(config: DictConfig) -> None:
         nonlocal status  # an error that reached Hydra would be announced a second time
         try:
+            if "plugins" in config:
+                plugins.use_named(config)
             task(config)
         except ConfigError as error:
             status = _complain(str(error), EXIT_USAGE)

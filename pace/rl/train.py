@@ -25,10 +25,13 @@ from omegaconf import DictConfig, OmegaConf
 
 from pace.command import run_command
 from pace.config.base import ConfigError, parse, to_dict
+from pace.config.predictor import PredictorPriors
 from pace.config.training import RESUME_KEYS, TrainConfig
+from pace.config.upgrade import upgrade_seams
 from pace.devices import resolve_device, threads_of
 from pace.distributed import Team, TeamError, own_device, suitable_size, team_of
-from pace.predictor.network import PredictorNetwork
+from pace.predictor.network import BallPredictor, make_predictor
+from pace.predictor.priors import resolve_priors
 from pace.rl.curriculum import Curriculum
 from pace.rl.rollout import RolloutError
 from pace.rl.trainer import Summary, Trainer, begins_anew, played_on
@@ -79,7 +82,7 @@ def resumed_config(saved: Checkpoint, path: str, overrides: list[str]) -> TrainC
         key = override.split("=")[0].lstrip("+~")
         if key not in RESUME_KEYS:
             raise ConfigError(f"'{key}' cannot change in a resumed run ({', '.join(RESUME_KEYS)} can): use init_from")
-    changed = OmegaConf.merge(OmegaConf.create(saved.config), OmegaConf.from_dotlist(overrides))
+    changed = OmegaConf.merge(OmegaConf.create(upgrade_seams(saved.config)), OmegaConf.from_dotlist(overrides))
     config = parse(OmegaConf.to_container(changed), TrainConfig)  # type: ignore[arg-type]
     config.resume, config.init_from, config.predictor_from = path, None, None
     if saved.counters["samples"] >= config.samples:
@@ -97,8 +100,9 @@ def build_trainer(config: TrainConfig, saved: Checkpoint | None, device: torch.d
     if config.num_worlds % team.size:
         raise ConfigError(f"num_worlds {config.num_worlds} cannot be shared equally by {team.size} processes")
     start = first_weights(config)
+    config.predictor = resolve_priors(config, learned_priors(start) if start else None)
     torch.manual_seed(config.seed)
-    predictor = PredictorNetwork(config.predictor).to(device)
+    predictor = make_predictor(config.predictor).to(device)
     anew = saved is not None and begins_anew(saved, team, device)
     again = int(saved.counters["updates"]) if saved and anew else 0  # or the run's beginning would be drawn once more
     make = partial(make_worlds, device=device, team=team, predictor=predictor, again=again)
@@ -114,7 +118,7 @@ def build_trainer(config: TrainConfig, saved: Checkpoint | None, device: torch.d
 
 
 def make_worlds(
-    task: TrainConfig, stage: int, device: torch.device, team: Team, predictor: PredictorNetwork, again: int = 0
+    task: TrainConfig, stage: int, device: torch.device, team: Team, predictor: BallPredictor, again: int = 0
 ) -> TableTennisEnv:
     """This process's worlds of one stage of the curriculum; each stage draws from random numbers of its own.
 
@@ -141,7 +145,13 @@ def first_weights(config: TrainConfig) -> Checkpoint | None:
         raise CheckpointError(f"{given.path} has no predictor: give predictor_from a run of pace.predictor.__main__")
     if start is None:
         return replace(given, weights={"predictor": given.weights["predictor"]})
-    return replace(start, weights=start.weights | {"predictor": given.weights["predictor"]})
+    task = start.config | {"predictor": given.config["predictor"]}
+    return replace(start, config=task, weights=start.weights | {"predictor": given.weights["predictor"]})
+
+
+def learned_priors(start: Checkpoint) -> PredictorPriors:
+    """The priors that belong to the predictor's weights in ``start``."""
+    return parse(upgrade_seams(start.config)["predictor"]["priors"], PredictorPriors)
 
 
 def open_run(config: TrainConfig, first_update: int) -> RunFolder:
@@ -156,13 +166,9 @@ def announce(trainer: Trainer, run: RunFolder, saved: Checkpoint | None) -> None
         anew = ", with worlds that begin anew" if begins_anew(saved, trainer.team, trainer.device) else ""
         print(f"going on from {saved.path}{anew}")
     shared = f" in {trainer.team.size} processes" if trainer.team.size > 1 else ""
-    agent = trainer.agent
-    number_format = str(agent.observation_dtype).removeprefix("torch.")
-    if agent.observation_dtype != torch.float32 and agent.fp32_below > 0.0:
-        number_format += f" (float32 below a std of {agent.fp32_below:g})"
     print(
         f"training {trainer.config.name}: {trainer.config.num_worlds} worlds on {trainer.device}{shared}, "
-        f"networks in {number_format}, run folder {run.path}",
+        f"{trainer.algorithm.describe()}, run folder {run.path}",
         flush=True,
     )
 

@@ -185,6 +185,7 @@ class Game:
 
     def __init__(self, config: TaskConfig, ball: BallSim, base_position: Tensor) -> None:
         count, device = ball.num_worlds, ball.device
+        self.landing_target = (config.landing_target[0], config.landing_target[1])  # m, x and y; of the returns
         self.clock = ServeClock(config.serve, count, device)
         self.referee = Referee(count, device)
         self.target = Target(config.reward, count, device)
