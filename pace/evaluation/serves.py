@@ -226,7 +226,7 @@ def evaluate_row(
     records = recorder.records[:-1].cpu()
     table = env.config.ball.table
     clear = table.height + table.net_height + env.config.ball.radius
-    summary = summarise(serve, records, env.game.landing_target, clear)
+    summary = summarise(serve, records, env.game.returns.wanted, clear)
     overall, by_time = recorder.predictor_errors()
     summary |= {
         "predictor_rmse_cm": overall,

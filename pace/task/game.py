@@ -5,7 +5,7 @@ The rules themselves are the kernels of :mod:`pace.task.game_kernels`; here are 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -86,10 +86,12 @@ class ReturnForecast(Part):
     """Forecast of the flight after a hit, kept until the next one.
 
     Attributes: ``landing`` (N, 3) m first contact with table or floor, ``net_height`` (N,) m above the floor when it
-    crosses the net towards +x, ``lands_own``, ``lands_opponent`` (N,) bool; NaN where there is none.
+    crosses the net towards +x, ``lands_own``, ``lands_opponent`` (N,) bool; NaN where there is none. ``wanted`` (x, y)
+    m, the task's landing target.
     """
 
-    def __init__(self, num_worlds: int, device: torch.device) -> None:
+    def __init__(self, wanted: Sequence[float], num_worlds: int, device: torch.device) -> None:
+        self.wanted = (wanted[0], wanted[1])
         self.landing = torch.full((num_worlds, 3), torch.nan, device=device)
         self.net_height = torch.full((num_worlds,), torch.nan, device=device)
         self.lands_own = torch.zeros(num_worlds, dtype=torch.bool, device=device)
@@ -185,11 +187,10 @@ class Game:
 
     def __init__(self, config: TaskConfig, ball: BallSim, base_position: Tensor) -> None:
         count, device = ball.num_worlds, ball.device
-        self.landing_target = (config.landing_target[0], config.landing_target[1])  # m, x and y; of the returns
         self.clock = ServeClock(config.serve, count, device)
         self.referee = Referee(count, device)
         self.target = Target(config.reward, count, device)
-        self.returns = ReturnForecast(count, device)
+        self.returns = ReturnForecast(config.landing_target, count, device)
         self.closeness = Closeness(count, device)
         self.ends = StepEnds(count, device)
         self.rules = rules_of(config)

@@ -155,7 +155,7 @@ def predicted_landing(state: TaskState, params: Params) -> Tensor:
 
     0 without a landing.
     """
-    (x, y), landing = state.game.landing_target, state.game.returns.landing
+    (x, y), landing = state.game.returns.wanted, state.game.returns.landing
     paid = state.game.referee.hit_now & landing[:, 0].isfinite()
     distance = torch.hypot(landing[:, 0] - x, landing[:, 1] - y)
     return torch.where(paid, params["offset"] - distance, 0.0)
