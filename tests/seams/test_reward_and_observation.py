@@ -98,13 +98,8 @@ def test_an_installed_entry_point_needs_no_naming(folder: Path) -> None:
     info = folder / "outside-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: outside\nVersion: 1.0\n")
-    entries = (
-        "[pace.reward_terms]",
-        "calm = outside_term:still_joints",
-        "[pace.observations]",
-        "over = outside_sight:ball_over_table",
-    )
-    (info / "entry_points.txt").write_text("\n".join(entries))
+    terms = "[pace.reward_terms]\ncalm = outside_term:still_joints\n"
+    (info / "entry_points.txt").write_text(f"{terms}[pace.observations]\nover = outside_sight:ball_over_table\n")
     assert TERMS["calm"].params is None
     assert POLICY["over"].size == 1
     env = make_env(2, "native", "cpu", overrides=["observation.policy=[heading,over]", "engine.threads=1"])
