@@ -249,7 +249,7 @@ def test_another_number_of_processes_resumes_what_was_learned() -> None:
     before: dict[str, Tensor] = {}
     after: dict[str, Tensor] = {}
     for state, found in ((saved.training, before), (again.training, after)):
-        flatten_tensors({part: state[part] for part in ("ppo", "regression")}, "", found)
+        flatten_tensors({part: state[part] for part in ("algorithm", "regression")}, "", found)
     assert before.keys() == after.keys()
     assert all(torch.equal(before[name], after[name]) for name in before)
     second.update()

@@ -10,10 +10,12 @@ from types import TracebackType
 import torch
 
 from pace.bench.training import BenchError
+from pace.config import plugins
 from pace.config.commands import BenchConfig
 from pace.devices import threads_of
 from pace.distributed import Team
-from pace.predictor.network import PredictorNetwork
+from pace.predictor.network import make_predictor
+from pace.predictor.priors import resolve_priors
 from pace.task.env import TableTennisEnv
 
 FAILED = "a process of the environment's crew failed; what it said stands above"
@@ -26,7 +28,7 @@ class EnvironmentLoop:
         config = copy.deepcopy(config)
         config.engine.name = engine
         self.control_steps, self.action_std = control_steps, config.bench.action_std
-        predictor = PredictorNetwork(config.predictor).to(device)
+        predictor = make_predictor(resolve_priors(config)).to(device)
         self.env = TableTennisEnv(config, config.num_worlds, device, config.seed, predictor)
         self.action = torch.zeros(config.num_worlds, self.env.action_spec.shape[-1], device=device)
         self.draw()
@@ -98,6 +100,7 @@ class EnvironmentCrew:
 def _serve(line: Connection, config: BenchConfig, engine: str, threads: int) -> None:
     """Settle, then play one repeat for each message, until the line is closed."""
     torch.set_num_threads(threads)
+    plugins.use(config.plugins)  # this is another process than the one that was told
     loop = EnvironmentLoop(config, engine, torch.device("cpu"), config.bench.control_steps)
     loop.play(config.bench.settle_steps)
     try:

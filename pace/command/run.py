@@ -15,6 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 from pace.command.arguments import plain_overrides, prepare
 from pace.command.help import command_help
 from pace.command.table import COMMANDS, Command
+from pace.config import plugins
 from pace.config.base import ConfigError, compose, config_dir, meant
 from pace.config.names import check_choice, split_override
 
@@ -31,7 +32,8 @@ def run_command(name: str, load: Callable[[], Work]) -> int:
     """Run the command ``name`` of :data:`COMMANDS` with ``sys.argv``; returns the exit status.
 
     ``load`` imports and returns the work; it is called when the configuration is composed, for torch takes seconds to
-    load. The work gets that configuration. Wrong input gives one line and status 2, an expected error one line and 1.
+    load. The work gets that configuration. Modules that the user names, in ``plugins`` or by an import path, are
+    imported first (:mod:`pace.config.plugins`). Wrong input gives one line and status 2, an expected error one line and 1.
     """
     try:
         if {"-h", "--help"} & set(sys.argv[1:]):
@@ -68,6 +70,8 @@ def _run_hydra(command: Command, load: Callable[[], Work]) -> int:
             status = complain(f"{error}: pip install 'pace-table-tennis[{command.extra}]'", EXIT_FAILED)
             return
         try:
+            if "plugins" in config:
+                plugins.use_named(config)
             task(config)
         except ConfigError as error:
             status = complain(str(error), EXIT_USAGE)

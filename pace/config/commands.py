@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from pace.config.base import require
 from pace.config.training import TrainConfig
@@ -88,6 +88,7 @@ class EvaluateConfig:
     sweep_rows: list[str]
     variations: VariationConfig
     paper: dict[str, PaperRow]
+    plugins: list[str] = field(default_factory=list)  # modules that add what the saved task needs
 
     def __post_init__(self) -> None:
         require(self.policy in ("run", "zero", "random"), f"policy must be run, zero or random, not {self.policy!r}")
@@ -109,6 +110,7 @@ class ExportConfig:
     check_steps: int
     tolerance: float  # rad, m, s
     seed: int
+    plugins: list[str] = field(default_factory=list)  # modules that add what the saved task needs
 
     def __post_init__(self) -> None:
         require(self.run is not None, "which run? give its folder, a checkpoint or pretrained/<name>")
@@ -132,6 +134,7 @@ class PlayConfig:
     width: int  # pixels of each view
     height: int
     fps: int
+    plugins: list[str] = field(default_factory=list)  # modules that add what the saved task needs
 
     def __post_init__(self) -> None:
         require(self.run is not None, "which run? give its folder, a checkpoint or pretrained/<name>")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from hydra.errors import HydraException
@@ -19,7 +20,7 @@ TASK_GROUPS = ("ball", "serve", "reset", "randomization", "sensing", "reward", "
 
 
 #: Parts of a saved task of which single values may be changed.
-CHANGEABLE = (*TASK_GROUPS, "engine")
+CHANGEABLE = (*TASK_GROUPS, "engine", "landing_target")
 
 
 #: Changes of a saved task that is played on a CPU, one world or a few, whatever it was trained on.
@@ -72,6 +73,11 @@ def override_task(config: TrainConfig, overrides: Sequence[str]) -> TrainConfig:
     except OmegaConfBaseException as error:
         raise ConfigError(str(error).split("\n")[0]) from error
     return parse(OmegaConf.to_container(changed), TrainConfig)  # type: ignore[arg-type]
+
+
+def without_reward(config: TrainConfig) -> TrainConfig:
+    """The same task for a policy that is only played: its reward has no terms, so that none has to be known."""
+    return replace(config, reward=replace(config.reward, terms={}))
 
 
 def _choose(choices: Mapping[str, str]) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, fields
 
+from pace.config import plugins
 from pace.config.base import Range, check_range, require
 
 
@@ -150,7 +151,7 @@ class SensingConfig:
 class EngineConfig:
     """The physics engine and its solver."""
 
-    name: str  # auto, native, mjwarp
+    name: str  # auto, native, mjwarp, or a class from outside: my_module:MyEngine
     physics_dt: float  # s
     solver_iterations: int
     line_search_iterations: int
@@ -163,7 +164,9 @@ class EngineConfig:
     graph: str = "auto"  # of CUDA for steps and resets on a GPU, of Warp for mjwarp on a CPU: auto, always, never
 
     def __post_init__(self) -> None:
-        require(self.name in ("auto", "native", "mjwarp"), f"engine must be auto, native or mjwarp, not {self.name!r}")
+        known = self.name in ("auto", "native", "mjwarp") or plugins.may_be_outside(plugins.ENGINES, self.name)
+        wanted = "auto, native or mjwarp, or come from a module named in plugins=[...]"
+        require(known, f"engine must be {wanted}, not {self.name!r}")
         require(self.physics_dt > 0, "engine.physics_dt must be positive")
         require(
             self.graph in ("auto", "always", "never"), f"engine.graph must be auto, always or never, not {self.graph!r}"

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field, fields
 
 from pace.config.base import Range, check_range, require
+from pace.config.predictor import PredictorConfig
 from pace.config.sim import SensingConfig, SimConfig
 
 
@@ -60,10 +61,14 @@ class ResetConfig:
 
 @dataclass
 class RewardTerm:
-    """One term: its weight, multiplied by the control step, and the numbers that it needs."""
+    """One term: its weight, multiplied by the control step, the numbers that it needs, and its function.
+
+    ``function``: name of a term or import path ``my_module:my_term``; null: the term of the same name.
+    """
 
     weight: float
     params: dict[str, float] = field(default_factory=dict)
+    function: str | None = None
 
 
 @dataclass
@@ -203,39 +208,6 @@ class ObservationConfig:
         require(self.critic_history >= 1, "observation.critic_history must be at least 1")
 
 
-COUNTED_FRAMES = 5  # the last positions that ``predictor.features=counted`` sees
-
-
-FRAME_DT = 0.02  # s, between the positions that ``predictor.features=flight`` fits
-
-
-@dataclass
-class PredictorConfig:
-    """The learned predictor of the ball's apex and its online regression."""
-
-    name: str
-    frames: int  # past ball positions it sees
-    hidden: list[int]
-    learning_rate: float
-    batch_size: int
-    batches_per_update: int
-    train_updates: int  # frozen afterwards; 0 trains it to the end
-    outputs: list[str]  # of apex (3), target (3), target_time (1)
-    enabled: bool  # off: the actor sees zeros instead (ablation)
-    features: str = "steps"  # steps (positions alone), counted (the last five, and how many there were before them), or
-    # flight (a fit of the whole flight); the latter two need many frames
-
-    def __post_init__(self) -> None:
-        known = ("steps", "counted", "flight")
-        require(self.features in known, f"predictor.features must be steps, counted or flight, not {self.features!r}")
-        enough = self.features != "counted" or self.frames > COUNTED_FRAMES
-        require(enough, f"predictor.features=counted needs more than {COUNTED_FRAMES} frames, got {self.frames}")
-        require(self.learning_rate > 0, "predictor.learning_rate must be positive")
-        for name in ("batch_size", "batches_per_update"):
-            require(getattr(self, name) >= 1, f"predictor.{name} must be at least 1, got {getattr(self, name)}")
-        require(min(self.hidden, default=1) >= 1, "predictor.hidden: a layer has at least 1 unit")
-
-
 @dataclass
 class TaskConfig(SimConfig):
     """The table-tennis task: the worlds, and what is asked, sensed and rewarded in them."""
@@ -246,3 +218,7 @@ class TaskConfig(SimConfig):
     sensing: SensingConfig
     observation: ObservationConfig
     predictor: PredictorConfig
+    landing_target: list[float]  # m, x and y on the opponent's half where a return should land
+
+    def __post_init__(self) -> None:
+        require(len(self.landing_target) == 2, f"landing_target needs two numbers, got {self.landing_target}")

@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
+from pace.config import plugins
 from pace.config.base import compose, parse, require
 from pace.config.names import check_renamed
-from pace.config.task import FRAME_DT, TaskConfig
+from pace.config.predictor import FRAME_DT
+from pace.config.task import TaskConfig
 
 
 @dataclass
@@ -20,7 +22,7 @@ class SchedulePoint:
 
 @dataclass
 class AlgoConfig:
-    """Asymmetric PPO."""
+    """The learning algorithm: asymmetric PPO, or what an algorithm from outside takes of these numbers."""
 
     name: str
     steps: int  # control steps a world plays per update
@@ -46,6 +48,8 @@ class AlgoConfig:
     autocast: str  # auto (bf16 where the hardware has it, down to fp32_below), bf16, fp32
     later_steps: list[SchedulePoint] = field(default_factory=list)  # in place of steps from that many control steps on
     fp32_below: float = 0.0  # mean std of the policy below which autocast=auto computes in float32
+    algorithm: str = "ppo"  # or a class from outside: my_module:MyAlgorithm
+    params: dict[str, float] = field(default_factory=dict)  # numbers that only an algorithm from outside knows
     observation_norm: bool = True  # by their running mean and spread; off: observations in their own units, clipped
 
     def steps_at(self, samples: float) -> int:
@@ -54,6 +58,9 @@ class AlgoConfig:
         return int(max(due, key=lambda point: point.samples).value) if due else self.steps
 
     def __post_init__(self) -> None:
+        known = self.algorithm == "ppo" or plugins.may_be_outside(plugins.ALGORITHMS, self.algorithm)
+        wanted = "ppo, or come from a module named in plugins=[...]"
+        require(known, f"algo.algorithm must be {wanted}, not {self.algorithm!r}")
         for point in self.later_steps:
             whole = point.value >= 1 and point.value == int(point.value)
             require(whole, f"algo.later_steps: {point.value} is no number of steps")
@@ -105,8 +112,10 @@ class TrainConfig(TaskConfig):
     # a run folder or checkpoint whose predictor to start from, instead of that of init_from
     predictor_from: str | None = field(default=None, kw_only=True)
     curriculum: list[Stage] = field(default_factory=list, kw_only=True)  # each changes the task of the one before
+    plugins: list[str] = field(default_factory=list, kw_only=True)  # modules that add terms, observations, ...
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         require(self.num_worlds >= 1, f"num_worlds must be at least 1, got {self.num_worlds}")
         require(self.processes >= 0, f"processes must be 0 (chosen for the machine) or more, got {self.processes}")
         require(
@@ -130,9 +139,13 @@ def load_train_config(overrides: list[str] | None = None) -> TrainConfig:
     Errors: :class:`ConfigError` for a bad value and for a name that is another one now.
     """
     check_renamed(overrides or [])
-    return parse(compose("train", overrides), TrainConfig)
+    composed = compose("train", overrides)
+    plugins.use_named(composed)
+    return parse(composed, TrainConfig)
 
 
 # What a resumed run may change; everything else is as it was saved, or the run would not go on where it stopped.
 # Other processes play other worlds, which begin anew.
-RESUME_KEYS = ("resume", "samples", "minutes", "checkpoint_minutes", "tensorboard", "progress", "device", "processes")
+RESUME_KEYS = (
+    "resume", "samples", "minutes", "checkpoint_minutes", "tensorboard", "progress", "device", "processes", "plugins"
+)  # fmt: skip

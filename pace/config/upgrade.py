@@ -11,10 +11,15 @@ from collections.abc import Callable, Sequence
 from copy import deepcopy
 from typing import Any
 
+from pace.config.base import to_dict
+from pace.config.predictor import PredictorPriors
 from pace.config.renamed import with_current_names
 
 #: Of what this version writes. 1 is that of version 0.1.0 up to commit 43400ac.
 FORMAT = 2
+
+#: Where a return should land if a saved configuration does not say (released configuration).
+LANDING_TARGET = (1.15, 0.0)  # m
 
 Saved = dict[str, Any]
 Upgrade = tuple[int, Callable[[Saved], None]]
@@ -51,8 +56,35 @@ def name_the_robots_parts(config: Saved) -> None:
     )
 
 
+def move_the_landing_target(config: Saved) -> None:
+    """``landing_target`` of the task was x and y of the reward term ``predicted_landing``."""
+    params = _entry(config, "reward", "terms", "predicted_landing", "params")
+    place = [params.pop(axis, known) for axis, known in zip("xy", LANDING_TARGET, strict=True)]
+    config.setdefault("landing_target", place)
+
+
+def store_the_predictors_priors(config: Saved) -> None:
+    """``predictor.priors`` were constants of the code."""
+    predictor = _entry(config, "predictor")
+    if predictor and predictor.get("priors") is None:
+        predictor["priors"] = to_dict(PredictorPriors())
+
+
+def _entry(config: Any, *keys: str) -> Saved:
+    """The dictionary under ``keys``; an empty one that belongs to nobody if there is none."""
+    for key in keys:
+        config = config.get(key) if isinstance(config, dict) else None
+    return config if isinstance(config, dict) else {}
+
+
 #: (format that it makes, function of the configuration).
-CONFIG_UPGRADES: list[Upgrade] = [(2, name_the_folder_out), (2, rename_choices), (2, name_the_robots_parts)]
+CONFIG_UPGRADES: list[Upgrade] = [
+    (2, name_the_folder_out),
+    (2, rename_choices),
+    (2, name_the_robots_parts),
+    (2, move_the_landing_target),
+    (2, store_the_predictors_priors),
+]
 #: (format that it makes, function of the training state: ``ppo``, ``regression`` and ``processes``, each of them with
 #: ``env`` and ``random``). Tensors are in their places.
 STATE_UPGRADES: list[Upgrade] = []

@@ -18,8 +18,7 @@ from pace.config.task import TaskConfig
 from pace.onboard.kernels import ATTITUDE_SIZE, DELAY_SIZE, MEMORY_SIZE
 from pace.onboard.returns import SEEN
 from pace.onboard.steps import AttitudeEstimateStep, DelayEstimateStep, JointEstimateStep, ReturnMemoryStep
-from pace.predictor.network import PredictorNetwork
-from pace.rl.agent import Policy
+from pace.predictor.network import BallPredictor
 from pace.rl.policies import TaskPolicy
 from pace.sim.robot import nominal_pose
 from pace.task.game import idle_point
@@ -250,7 +249,7 @@ class Prediction(NamedTuple):
 class PredictionReader(nn.Module):
     """The predictor, and what the actor sees of its output; zeros without a predictor (ablation)."""
 
-    def __init__(self, config: TaskConfig, predictor: PredictorNetwork | None) -> None:
+    def __init__(self, config: TaskConfig, predictor: BallPredictor | None) -> None:
         super().__init__()
         reward = config.reward
         self.predictor = predictor if config.predictor.enabled else None
@@ -276,7 +275,7 @@ class PredictionReader(nn.Module):
         stand = torch.where(hit, above + self.arm_offset, self.idle_base)
         return Prediction(apex, target, time, stand - base_position[..., :2])
 
-    def _parts(self, predictor: PredictorNetwork, tracks: Tensor) -> dict[str, Tensor]:
+    def _parts(self, predictor: BallPredictor, tracks: Tensor) -> dict[str, Tensor]:
         output = predictor(tracks.flatten(0, 1)).unflatten(0, tracks.shape[:2])
         parts = {name: output[..., columns] for name, columns in predictor.slices.items()}
         apex = parts["apex"]
@@ -300,7 +299,7 @@ class DeployedPolicy(nn.Module):
 
     def __init__(self, policy: TaskPolicy, model: mujoco.MjModel) -> None:
         super().__init__()
-        if not isinstance(policy.act, Policy):
+        if not isinstance(policy.act, nn.Module):
             raise TypeError(f"policy {policy.source} is no network: only a saved policy can be deployed")
         config = policy.config
         check_policy(config.observation, config.predictor)

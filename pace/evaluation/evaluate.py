@@ -74,9 +74,8 @@ def evaluate_table(
     ]
     folder.mkdir(parents=True, exist_ok=True)
     print(f"\n{tables(rows, config.paper)}\n")
-    target = task.reward.terms["predicted_landing"].params
-    files = write_report(folder, rows, config.paper, context)
-    _announce([*files, *write_figures(folder, rows, task.ball.table, (target["x"], target["y"]))])
+    files, target = write_report(folder, rows, config.paper, context), (task.landing_target[0], task.landing_target[1])
+    _announce([*files, *write_figures(folder, rows, task.ball.table, target)])
 
 
 def choose_policy(config: EvaluateConfig) -> TaskPolicy:

@@ -114,7 +114,7 @@ def landing_map(rows: Sequence[Row], table: TableConfig, target: tuple[float, fl
             linewidths=0,
             label=label,
         )
-    axes.plot(*target, marker="+", color="black", markersize=12, linestyle="none", label="target of the reward")
+    axes.plot(*target, marker="+", color="black", markersize=12, linestyle="none", label="landing target")
     axes.set(xlabel="x, m (towards the opponent)", ylabel="y, m (to the robot's left)", xlim=LANDING_X, ylim=LANDING_Y)
     axes.set_title(f"where returns came down first, table from above ({_beyond(records)} beyond the picture)")
     _finish(axes)

@@ -224,10 +224,9 @@ def evaluate_row(
     recorder = ServeRecorder(env, warmup_serves, math.ceil(serves / num_worlds))
     play(env, policy, recorder, on_count)
     records = recorder.records[:-1].cpu()
-    target = env.config.reward.terms["predicted_landing"].params
     table = env.config.ball.table
     clear = table.height + table.net_height + env.config.ball.radius
-    summary = summarise(serve, records, (target["x"], target["y"]), clear)
+    summary = summarise(serve, records, env.game.landing_target, clear)
     overall, by_time = recorder.predictor_errors()
     summary |= {
         "predictor_rmse_cm": overall,

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from pace.predictor.forecast import forecast_flight
-    from pace.predictor.network import PredictorNetwork
+    from pace.predictor.network import BallPredictor, PredictorNetwork
     from pace.sim.ball.ball import Forecast
 
-__all__ = ["Forecast", "PredictorNetwork", "forecast_flight"]
+__all__ = ["BallPredictor", "Forecast", "PredictorNetwork", "forecast_flight"]
 
 
 def __getattr__(name: str) -> Any:
@@ -22,10 +22,10 @@ def __getattr__(name: str) -> Any:
         from pace.predictor.forecast import forecast_flight
 
         return forecast_flight
-    if name == "PredictorNetwork":
-        from pace.predictor.network import PredictorNetwork
+    if name in ("BallPredictor", "PredictorNetwork"):
+        from pace.predictor import network
 
-        return PredictorNetwork
+        return getattr(network, name)
     if name == "Forecast":
         from pace.sim.ball.ball import Forecast
 

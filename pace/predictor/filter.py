@@ -1,19 +1,22 @@
 """Two parabolas through the whole flight so far, joined by the bounce: least squares with priors, on tensors.
 
 Before the bounce position, velocity and acceleration of each axis are fitted to every sensed position, after it again,
-starting from where and how fast the first parabola says that the ball leaves the table. Gravity, drag and the table are
-priors, as wide as what differs from serve to serve and from ball to ball; what they get wrong the network behind it
-learns. Only positions are used, so that a window that holds the whole flight is all the state there is.
+starting from where and how fast the first parabola says that the ball leaves the table. Launch, gravity, drag and the
+table are priors, as wide as what differs from serve to serve and from ball to ball; what they get wrong the network
+behind it learns. Those of the serve come from the configuration (:class:`pace.config.task.PredictorPriors`). Only
+positions are used, so that a window that holds the whole flight is all the state there is.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from pace.config.task import FRAME_DT as FRAME
+from pace.config.predictor import FRAME_DT as FRAME
+from pace.config.predictor import PredictorPriors
 
 UNIT = 0.4  # s; times in the fits are in this unit, so that the sums are of order one
 NOISE = 0.004  # m, standard deviation of a sensed position (uniform +-7 mm)
@@ -21,11 +24,6 @@ CONTACT_HEIGHT = 0.78  # m, centre of a ball on the table
 LOW = 0.9  # m; a ball that turns up again below it has bounced: in 20 ms it falls 6 cm at most
 # A sensed position is up to 10 ms old, and linear between frames: around the bounce it lies on neither parabola.
 AFTER_BOUNCE = 0.013  # s
-# What differs how much from serve to serve and from ball to ball, mean and standard deviation (m, m/s, m/s^2; x, y, z):
-# the launch, whose position is seen; the accelerations of both parabolas, of which drag is 4 m/s^2 at 6 m/s.
-LAUNCH_VELOCITY = ((-5.75, -0.2, 1.75), (0.6, 0.5, 0.25))
-FALL = ((4.0, 0.0, -9.8), (0.8, 0.2, 0.3))
-RISE = ((2.0, 0.0, -10.4), (0.4, 0.2, 0.4))
 LEAST_GRAVITY = 5.0  # m/s^2 downwards, for what is no flight: a ball that rolls
 SEEN = (1.0, 1.0, 1.0)  # m
 BOUNCE_WIDTH = ((0.003, 0.003, 0.003), (0.25, 0.06, 0.06))  # of position and velocity behind the bounce
@@ -82,7 +80,7 @@ class Fit(nn.Module):
     scale: Tensor
     prior: Tensor
 
-    def __init__(self, width: tuple[tuple[float, ...], ...]) -> None:
+    def __init__(self, width: tuple[Sequence[float], ...]) -> None:
         super().__init__()
         scale = torch.tensor([1.0, UNIT, 0.5 * UNIT**2])
         self.register_buffer("scale", scale, persistent=False)
@@ -113,17 +111,17 @@ def solve(matrix: Tensor, vector: Tensor) -> Tensor:
 
 
 class FlightFilter(nn.Module):
-    """Fits a :class:`Flight` to each of N windows of ``window`` positions."""
+    """Fits a :class:`Flight` to each of N windows of ``window`` positions, with the ``priors`` of their serves."""
 
     ages: Tensor
     means: Tensor
 
-    def __init__(self, window: int) -> None:
+    def __init__(self, window: int, priors: PredictorPriors) -> None:
         super().__init__()
-        self.fall = Fit((SEEN, LAUNCH_VELOCITY[1], FALL[1]))
-        self.rise = Fit((*BOUNCE_WIDTH, RISE[1]))
+        self.fall = Fit((SEEN, priors.launch_velocity.std, priors.fall.std))
+        self.rise = Fit((*BOUNCE_WIDTH, priors.rise.std))
         self.register_buffer("ages", FRAME * torch.arange(1.0 - window, 1.0), persistent=False)
-        means = torch.tensor([LAUNCH_VELOCITY[0], FALL[0], RISE[0]])
+        means = torch.tensor([priors.launch_velocity.mean, priors.fall.mean, priors.rise.mean])
         self.register_buffer("means", means, persistent=False)
 
     def forward(self, frames: Tensor) -> Flight:

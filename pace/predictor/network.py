@@ -2,36 +2,29 @@
 
 ``features: steps`` sees positions and nothing else (paper). For windows that hold the whole flight, ``counted`` sees
 the last five of them and how many there were, and ``flight`` fits two parabolas to all (:mod:`pace.predictor.filter`)
-and learns what these get wrong.
+and learns what these get wrong. Any other predictor is a :class:`BallPredictor`, from the package or from outside
+(:mod:`pace.config.plugins`).
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from itertools import accumulate, pairwise
 
 import torch
 from torch import Tensor, nn
 
+from pace.config import plugins
 from pace.config.base import ConfigError
-from pace.config.task import COUNTED_FRAMES, PredictorConfig
-from pace.predictor.filter import FALL, RISE, FlightFilter
+from pace.config.predictor import COUNTED_FRAMES, FEATURES, PredictorConfig, PredictorPriors, Prior
+from pace.predictor.filter import FlightFilter
 
 OUTPUT_SIZES = {"apex": 3, "target": 3, "target_time": 1}
 
-# Scaling to numbers of order one (world frame, m and s). A serve crosses the table (|x| <= 1.37, |y| <= 0.76) between
-# its top and about 0.5 m above it, and its apex after the bounce lies at or behind the robot's end of the table.
-# Between two frames (20 ms) it moves by about (-0.11, 0, 0) m, and serves differ in that by a few centimetres.
-POSITION_CENTRE, POSITION_SCALE = (0.0, 0.0, 1.0), (1.0, 0.4, 0.25)
-STEP_CENTRE, STEP_SCALE = (-0.11, 0.0, 0.0), (0.02, 0.02, 0.03)
 COUNT_CENTRE, COUNT_SCALE = 20.0, 10.0  # frames since the launch
-# What the fit of a flight says, likewise (m, s, m/s): times, velocities before and after the bounce, where it bounces.
+# What the fit of a flight says of times, as numbers of order one (s; frames after the bounce).
 AGE_CENTRE, AGE_SCALE, FRAMES_SCALE = 0.35, 0.25, 6.0
-FALL_CENTRE, FALL_SCALE = (-5.2, -0.2, -0.5), (0.5, 0.35, 1.5)
-RISE_CENTRE, RISE_SCALE = (-4.1, -0.15, 2.6), (0.5, 0.3, 0.25)
-BOUNCE_CENTRE, BOUNCE_SCALE = (-1.0, -0.1, 0.78), (0.25, 0.2, 0.02)
 LARGEST_FEATURE = 5.0
-OUTPUT_CENTRES = {"apex": (-1.5, 0.0, 1.0), "target": (-1.6, 0.0, 1.0), "target_time": (0.3,)}
-OUTPUT_SCALES = {"apex": (0.3, 0.25, 0.12), "target": (0.25, 0.25, 0.15), "target_time": (0.25,)}
 
 
 def predictor_slices(outputs: list[str]) -> dict[str, slice]:
@@ -53,16 +46,15 @@ class FlightFeatures(nn.Module):
     scale: Tensor
     size = 26
 
-    def __init__(self, frames: int) -> None:
+    def __init__(self, frames: int, priors: PredictorPriors) -> None:
         super().__init__()
-        self.filter = FlightFilter(frames)
-        times = ((AGE_CENTRE, 0.0, AGE_CENTRE, 0.0, 0.0), (AGE_SCALE, AGE_SCALE, AGE_SCALE, FRAMES_SCALE, 1.0))
-        places = (POSITION_CENTRE, POSITION_SCALE), (FALL_CENTRE, FALL_SCALE), FALL
-        places = *places, (BOUNCE_CENTRE, BOUNCE_SCALE), (RISE_CENTRE, RISE_SCALE), RISE
-        apex = OUTPUT_CENTRES["apex"], OUTPUT_SCALES["apex"]
-        centre, scale = zip(times, *places, apex, strict=True)
-        self.register_buffer("centre", torch.tensor([v for part in centre for v in part]), persistent=False)
-        self.register_buffer("scale", torch.tensor([v for part in scale for v in part]), persistent=False)
+        self.filter = FlightFilter(frames, priors)
+        ages = [AGE_SCALE, AGE_SCALE, AGE_SCALE, FRAMES_SCALE, 1.0]
+        times = Prior([AGE_CENTRE, 0.0, AGE_CENTRE, 0.0, 0.0], ages)
+        before, after = (priors.position, priors.fall_velocity, priors.fall), (priors.rise_velocity, priors.rise)
+        parts = (times, *before, priors.bounce, *after, priors.apex)
+        self.register_buffer("centre", torch.tensor([v for part in parts for v in part.mean]), persistent=False)
+        self.register_buffer("scale", torch.tensor([v for part in parts for v in part.std]), persistent=False)
 
     def forward(self, frames: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(N, W, 3) m -> features (N, size), apex (N, 3) m, and time to it (N, 1) s, both as fitted."""
@@ -73,21 +65,17 @@ class FlightFeatures(nn.Module):
         return features, flight.apex, flight.apex_delay - flight.bounce_age
 
 
-class PredictorNetwork(nn.Module):
-    """MLP with ReLU over ``config.frames`` ball positions; input and output are in metres and seconds, world frame.
+class BallPredictor(nn.Module, ABC):
+    """A predictor that trains and plays: (N, 3 frames) ball positions -> (N, out), both in m and s, world frame.
 
-    The frames are ordered from the oldest to the newest. Inside, they become the newest position and the steps between
-    frames, scaled: the same information, but the small differences that carry the velocity are as large as the rest.
-    With ``config.features`` "counted" those are the last five, and the number of frames since the launch goes with
-    them: the window holds its first position over and over where the flight was shorter.
-    With "flight" they become a fit of the flight, and the MLP gives what its apex lacks.
-    Outputs stand in the order of ``config.outputs``; ``slices[name]`` finds them.
+    The frames are ordered from the oldest to the newest, 20 ms apart; before a ball has been seen so often, its first
+    position is repeated. Outputs stand in the order of ``config.outputs``; ``slices[name]`` finds them. The regression
+    compares them in units of their scales, which are priors.
+
+    Args: config: of the predictor, with priors (:func:`pace.predictor.priors.resolve_priors`); without, the measured.
+    Errors: :class:`ConfigError` for unknown outputs, and fewer than two frames.
     """
 
-    position_centre: Tensor
-    position_scale: Tensor
-    step_centre: Tensor
-    step_scale: Tensor
     output_centre: Tensor
     output_scale: Tensor
 
@@ -98,25 +86,56 @@ class PredictorNetwork(nn.Module):
             raise ConfigError(f"predictor.frames must be at least 2 to see a velocity, got {config.frames}")
         self.frames = config.frames
         self.outputs = list(config.outputs)
-        self.flight = FlightFeatures(config.frames) if config.features == "flight" else None
+        self.priors = config.priors or PredictorPriors()
         self.input_size = 3 * config.frames
         self.output_size = sum(OUTPUT_SIZES[name] for name in self.outputs)
-        self._scaling("position", POSITION_CENTRE, POSITION_SCALE)
-        self._scaling("step", STEP_CENTRE, STEP_SCALE)
-        centre = [value for name in self.outputs for value in OUTPUT_CENTRES[name]]
-        scale = [value for name in self.outputs for value in OUTPUT_SCALES[name]]
-        self._scaling("output", centre, scale)
+        known = {"apex": self.priors.apex, "target": self.priors.target, "target_time": self.priors.target_time}
+        mean = [value for name in self.outputs for value in known[name].mean]
+        self.register_scaling("output", Prior(mean, [value for name in self.outputs for value in known[name].std]))
+
+    def register_scaling(self, name: str, prior: Prior) -> None:
+        """Buffers ``<name>_centre`` and ``<name>_scale``, which belong to the configuration and not to the weights."""
+        self.register_buffer(f"{name}_centre", torch.tensor(prior.mean), persistent=False)
+        self.register_buffer(f"{name}_scale", torch.tensor(prior.std), persistent=False)
+
+    @abstractmethod
+    def scaled(self, positions: Tensor) -> Tensor:
+        """Outputs in units of their scales, (N, out): what the regression compares."""
+
+    def scale_target(self, target: Tensor) -> Tensor:
+        """True outputs (N, out), m and s -> units of their scales."""
+        return (target - self.output_centre) / self.output_scale
+
+    def forward(self, positions: Tensor) -> Tensor:
+        """(N, 3 frames) ball positions, oldest first -> (N, out) predictions, m and s."""
+        return torch.addcmul(self.output_centre, self.scaled(positions), self.output_scale)
+
+
+class PredictorNetwork(BallPredictor):
+    """MLP with ReLU over ``config.frames`` ball positions.
+
+    Inside, they become the newest position and the steps between frames, scaled: the same information, but the small
+    differences that carry the velocity are as large as the rest.
+    With ``config.features`` "counted" those are the last five, and the number of frames since the launch goes with
+    them: the window holds its first position over and over where the flight was shorter.
+    With "flight" they become a fit of the flight, and the MLP gives what its apex lacks.
+    """
+
+    position_centre: Tensor
+    position_scale: Tensor
+    step_centre: Tensor
+    step_scale: Tensor
+
+    def __init__(self, config: PredictorConfig) -> None:
+        super().__init__(config)
+        self.flight = FlightFeatures(config.frames, self.priors) if config.features == "flight" else None
+        self.register_scaling("position", self.priors.position)
+        self.register_scaling("step", self.priors.step)
         self.counted = config.features == "counted"
         seen = 3 * COUNTED_FRAMES + 1 if self.counted else self.input_size
         sizes = [self.flight.size if self.flight else seen, *config.hidden]
         hidden = [part for a, b in pairwise(sizes) for part in (nn.Linear(a, b), nn.ReLU())]
         self.layers = nn.Sequential(*hidden, nn.Linear(sizes[-1], self.output_size))
-
-    def _scaling(
-        self, name: str, centre: list[float] | tuple[float, ...], scale: list[float] | tuple[float, ...]
-    ) -> None:
-        self.register_buffer(f"{name}_centre", torch.tensor(centre), persistent=False)
-        self.register_buffer(f"{name}_scale", torch.tensor(scale), persistent=False)
 
     def features(self, positions: Tensor) -> Tensor:
         """(N, 3 frames) ball positions -> scaled newest position and steps (N, 3 frames), or those of the last five and
@@ -134,7 +153,7 @@ class PredictorNetwork(nn.Module):
         return torch.cat([newest, steps.flatten(1)], dim=1)
 
     def scaled(self, positions: Tensor) -> Tensor:
-        """Outputs in units of their scales, (N, out): what the regression compares."""
+        """See :class:`BallPredictor`."""
         if self.flight is None:
             return self.layers(self.features(positions))
         features, apex, delay = self.flight(positions.unflatten(1, (self.frames, 3)))
@@ -142,10 +161,19 @@ class PredictorNetwork(nn.Module):
         fitted = self.scale_target(torch.cat([known[name] for name in self.outputs], dim=1))
         return self.layers(features) + fitted.clamp(-LARGEST_FEATURE, LARGEST_FEATURE)
 
-    def scale_target(self, target: Tensor) -> Tensor:
-        """True outputs (N, out), m and s -> units of their scales."""
-        return (target - self.output_centre) / self.output_scale
 
-    def forward(self, positions: Tensor) -> Tensor:
-        """(N, 3 frames) ball positions, oldest first -> (N, out) predictions, m and s."""
-        return torch.addcmul(self.output_centre, self.scaled(positions), self.output_scale)
+def _accept(found: object) -> type[BallPredictor]:
+    if not (isinstance(found, type) and issubclass(found, BallPredictor)):
+        raise TypeError("a predictor is a subclass of pace.predictor.network.BallPredictor")
+    return found
+
+
+#: All predictors by ``predictor.features``.
+PREDICTORS: plugins.Registry[type[BallPredictor]] = plugins.Registry(
+    "predictor", plugins.PREDICTORS, _accept, dict.fromkeys(FEATURES, PredictorNetwork), where="predictor.features="
+)
+
+
+def make_predictor(config: PredictorConfig) -> BallPredictor:
+    """An untrained predictor. Errors: :class:`ConfigError` for unknown features or outputs."""
+    return PREDICTORS[config.features](config)

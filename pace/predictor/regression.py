@@ -8,9 +8,9 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from pace.config.task import PredictorConfig
+from pace.config.predictor import PredictorConfig
 from pace.distributed import Team
-from pace.predictor.network import PredictorNetwork
+from pace.predictor.network import BallPredictor
 from pace.runs.optimiser import load_optimiser_state, optimiser_state
 
 TIME_BINS = (0.0, 0.1, 0.2, 0.3, 0.4)  # s before the apex; the first and the last bin are open
@@ -27,7 +27,7 @@ class PredictorSource(Protocol):
 
 
 class PredictorTrainer:
-    """Adam on a :class:`PredictorNetwork`, which it changes in place, over samples of the last (steps, N) rollout.
+    """Adam on a :class:`BallPredictor`, which it changes in place, over samples of the last (steps, N) rollout.
 
     After ``config.train_updates`` updates the network is frozen (0: never); errors are measured all the same. The
     processes of a ``team`` share the samples of a batch.
@@ -35,7 +35,7 @@ class PredictorTrainer:
 
     def __init__(
         self,
-        network: PredictorNetwork,
+        network: BallPredictor,
         config: PredictorConfig,
         steps: int,
         num_worlds: int,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import NamedTuple
 
 import torch
 from tensordict.nn import (
@@ -45,6 +46,14 @@ def compute_dtype(autocast: str, device: torch.device) -> torch.dtype:
     if device.type == "cuda":
         return torch.bfloat16 if torch.cuda.is_bf16_supported(including_emulation=False) else torch.float32
     return torch.bfloat16 if torch.cpu._is_avx512_bf16_supported() else torch.float32
+
+
+class Sizes(NamedTuple):
+    """Numbers in the actor's and the critic's observation, and in the action."""
+
+    policy: int
+    critic: int
+    actions: int
 
 
 class RunningNorm(nn.Module):

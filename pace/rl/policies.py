@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,14 +11,14 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from pace.arrays.state import under_prefix
 from pace.config.base import ConfigError, config_dir, meant, parse
-from pace.config.overrides import override_task, stage_tasks
-from pace.config.task import PredictorConfig
+from pace.config.overrides import override_task, stage_tasks, without_reward
+from pace.config.predictor import PredictorConfig
 from pace.config.training import TrainConfig
 from pace.devices import resolve_device
-from pace.predictor.network import PredictorNetwork
-from pace.rl.agent import Policy
+from pace.predictor.network import BallPredictor, make_predictor
+from pace.rl.agent import Sizes
+from pace.rl.algorithm import ALGORITHMS
 from pace.runs.checkpoint import META, TRAINING, WEIGHTS, Checkpoint, CheckpointError, load_checkpoint, load_weights
 from pace.task.observations import JOINTS, POLICY
 
@@ -38,7 +39,7 @@ class TaskPolicy:
 
     config: TrainConfig
     act: Callable[[Tensor], Tensor]
-    predictor: PredictorNetwork | None
+    predictor: BallPredictor | None
     source: str
     counters: Mapping[str, float] = field(default_factory=dict)
 
@@ -55,9 +56,16 @@ class TaskPolicy:
         return self
 
     def make_env(
-        self, num_worlds: int = 64, device: str = "auto", seed: int = 1, overrides: Sequence[str] = ()
+        self,
+        num_worlds: int = 64,
+        device: str = "auto",
+        seed: int = 1,
+        overrides: Sequence[str] = (),
+        rewards: bool = False,
     ) -> TableTennisEnv:
         """The saved task in N worlds, with the saved predictor; the policy moves to the same device.
+
+        Without ``rewards`` none is computed (it is 0), and the saved reward's terms need not be known.
 
         ``overrides`` are those of :func:`override_task`, such as ``["serve=mixed", "engine.physics_dt=0.002"]``.
         Errors: :class:`ConfigError` for a wrong key or value, an engine or a device that is not there.
@@ -67,7 +75,7 @@ class TaskPolicy:
         where = resolve_device(device)
         self.to(where)
         config = override_task(self.config, overrides)
-        return TableTennisEnv(config, num_worlds, where, seed, self.predictor)
+        return TableTennisEnv(config if rewards else without_reward(config), num_worlds, where, seed, self.predictor)
 
 
 @dataclass(frozen=True)
@@ -75,40 +83,49 @@ class TrainedPredictor:
     """A saved predictor and how it was configured."""
 
     config: PredictorConfig
-    network: PredictorNetwork
+    network: BallPredictor
 
 
 def load_policy(path: str | Path, device: str | torch.device = "cpu") -> TaskPolicy:
     """The policy of a run folder (its newest checkpoint), a checkpoint, a file in one, or ``pretrained/<name>``.
 
-    Nothing in the files is executed or unpickled.
+    Nothing in the files is executed or unpickled. A module that an import path in the configuration names is not
+    imported unless the user has named it: :func:`pace.config.plugins.use`.
 
     Errors: :class:`CheckpointError` for a folder that is no run, another format, a missing, reshaped or broken tensor,
     and a configuration of another version.
     """
     checkpoint = load_checkpoint(locate(path), weights_only=True)
-    config = saved_config(checkpoint)
-    predictor = PredictorNetwork(config.predictor)
-    network = Policy.build(policy_size(config), JOINTS, config.algo)
-    agent = _part(checkpoint, "agent")
-    parts = (
-        ("normaliser", network.norm, under_prefix("policy_norm", agent)),
-        ("actor", network.mlp, under_prefix("actor.mlp", agent)),
-        ("predictor", predictor, _part(checkpoint, "predictor")),
-    )
-    for name, module, weights in parts:
-        load_weights(module, weights, f"{checkpoint.path} ({name})")
-        module.requires_grad_(False).eval()
-    return TaskPolicy(config, network, predictor, str(checkpoint.path), checkpoint.counters).to(device)
+    config, source = saved_config(checkpoint), str(checkpoint.path)
+    sizes = Sizes(policy_size(config), 0, JOINTS)
+    with _outside_named(source):
+        algorithm = ALGORITHMS[config.algo.algorithm]
+    network = algorithm.load_policy(_part(checkpoint, "agent"), sizes, config.algo, source)
+    predictor = _load_predictor(checkpoint, config.predictor)
+    return TaskPolicy(config, network.requires_grad_(False).eval(), predictor, source, checkpoint.counters).to(device)
 
 
 def load_predictor(path: str | Path) -> TrainedPredictor:
     """The predictor of a run, of a policy or trained alone; ``path`` and errors as those of :func:`load_policy`."""
     checkpoint = load_checkpoint(locate(path), weights_only=True)
     config = saved_config(checkpoint).predictor
-    network = PredictorNetwork(config)
+    return TrainedPredictor(config, _load_predictor(checkpoint, config))
+
+
+def _load_predictor(checkpoint: Checkpoint, config: PredictorConfig) -> BallPredictor:
+    with _outside_named(str(checkpoint.path)):
+        network = make_predictor(config)
     load_weights(network, _part(checkpoint, "predictor"), f"{checkpoint.path} (predictor)")
-    return TrainedPredictor(config, network.requires_grad_(False).eval())
+    return network.requires_grad_(False).eval()
+
+
+@contextmanager
+def _outside_named(source: str) -> Iterator[None]:
+    """Errors: :class:`CheckpointError` for what ``source`` needs from outside of pace, and the user has not named."""
+    try:
+        yield
+    except ConfigError as error:
+        raise CheckpointError(f"{source}: {error}") from error
 
 
 def locate(path: str | Path) -> Path:
@@ -142,10 +159,11 @@ def saved_config(checkpoint: Checkpoint) -> TrainConfig:
 
 def policy_size(config: TrainConfig) -> int:
     """Numbers in the actor's observation: those of a frame, times its history."""
-    unknown = [name for name in config.observation.policy if name not in POLICY]
-    if unknown:
-        raise CheckpointError(f"the policy observes '{unknown[0]}', which this version of pace does not know")
-    return config.observation.policy_history * sum(POLICY[name].size for name in config.observation.policy)
+    size = 0
+    for name in config.observation.policy:
+        with _outside_named(f"the policy observes '{name}', which this version of pace does not know"):
+            size += POLICY[name].size
+    return config.observation.policy_history * size
 
 
 def _part(checkpoint: Checkpoint, name: str) -> dict[str, Tensor]:

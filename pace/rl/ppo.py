@@ -1,8 +1,12 @@
-"""The PPO update: TorchRL's ClipPPOLoss and KL-adaptive learning rate, over minibatches gathered into fixed buffers."""
+"""PPO: its update and the algorithm that the trainer runs.
+
+The update is TorchRL's ClipPPOLoss and KL-adaptive learning rate, over minibatches gathered into fixed buffers.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -10,11 +14,13 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives import ClipPPOLoss, KLAdaptiveLR
 
+from pace.arrays.state import under_prefix
 from pace.config.base import ConfigError
 from pace.config.training import AlgoConfig
 from pace.distributed import Team
-from pace.rl.agent import Agent, scheduled
-from pace.rl.rollout import Rollout, RolloutError
+from pace.rl.agent import Agent, Policy, RunningNorm, Sizes, scheduled
+from pace.rl.rollout import Rollout, RolloutError, VectorTask
+from pace.runs.checkpoint import load_weights
 from pace.runs.optimiser import load_optimiser_state, optimiser_state
 
 LOSS_METRICS = (
@@ -179,3 +185,88 @@ class PPO:
 def gradients(parameters: list[nn.Parameter]) -> list[Tensor]:
     """The gradients of those parameters that have one."""
     return [parameter.grad for parameter in parameters if parameter.grad is not None]
+
+
+class AsymmetricPPO:
+    """PPO with an actor on sensed and a critic on true observations: see :class:`pace.rl.algorithm.Algorithm`.
+
+    Attributes: ``agent``, ``ppo`` its learner, ``rollout`` its storage, ``None`` before the first :meth:`prepare`.
+    """
+
+    rollout: Rollout | None = None
+
+    def __init__(self, sizes: Sizes, config: AlgoConfig, device: torch.device, team: Team) -> None:
+        self.config, self.team = config, team
+        self.agent = Agent(*sizes, config, device)
+        self.ppo = PPO(self.agent, config, team)
+
+    def prepare(self, env: VectorTask, samples: float) -> int:
+        """Storage for these worlds, the steps of ``algo.later_steps``, and the networks' number format."""
+        steps, old = self.config.steps_at(samples), self.rollout
+        self.agent.choose_dtype()
+        fits = old is not None and old.env is env and old.steps == steps
+        if old is None or not fits or old.policy.dtype != self.agent.observation_dtype:
+            self.rollout = Rollout(env, self.agent, steps)
+        return steps
+
+    @property
+    def _stored(self) -> Rollout:
+        assert self.rollout is not None  # prepare() comes first
+        return self.rollout
+
+    def begin(self) -> None:
+        """Freeze the policy's standard deviation; note what the normalisers have seen."""
+        self._moments = [norm.moments() for norm in self._norms()]
+        self._stored.begin()
+
+    def step(self, t: int) -> None:
+        """See :meth:`Rollout.step`."""
+        self._stored.step(t)
+
+    def finish(self) -> None:
+        """Values and advantages."""
+        self._stored.finish(self.config.gamma, self.config.gae_lambda)
+
+    def fault(self) -> str | None:
+        """See :meth:`Rollout.fault`."""
+        return self._stored.fault()
+
+    def update(self, samples: float) -> dict[str, float]:
+        """One set of normalisers for all processes, then :meth:`PPO.update`."""
+        for norm, moments in zip(self._norms(), self._moments, strict=True):
+            norm.pool(moments, self.team)
+        return self.ppo.update(self._stored, samples)
+
+    def _norms(self) -> tuple[RunningNorm, RunningNorm]:
+        return self.agent.policy_norm, self.agent.critic_norm
+
+    def weights_loaded(self, new_run: bool) -> None:
+        """A new run begins with its own standard deviation."""
+        if new_run:
+            self.agent.actor.bound_std(self.config.std_floor, self.config.std[0].value)
+        self.agent.choose_dtype()
+
+    def describe(self) -> str:
+        """The networks' number format."""
+        agent = self.agent
+        number_format = str(agent.observation_dtype).removeprefix("torch.")
+        if agent.observation_dtype != torch.float32 and agent.fp32_below > 0.0:
+            number_format += f" (float32 below a std of {agent.fp32_below:g})"
+        return f"networks in {number_format}"
+
+    def state_dict(self) -> dict[str, Any]:
+        """See :meth:`PPO.state_dict`."""
+        return self.ppo.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` gave."""
+        self.ppo.load_state_dict(state)
+
+    @staticmethod
+    def load_policy(weights: Mapping[str, Tensor], sizes: Sizes, config: AlgoConfig, source: str) -> Policy:
+        """The mean action of the trained actor."""
+        network = Policy.build(sizes.policy, sizes.actions, config)
+        parts = (("normaliser", network.norm, "policy_norm"), ("actor", network.mlp, "actor.mlp"))
+        for name, module, prefix in parts:
+            load_weights(module, under_prefix(prefix, dict(weights)), f"{source} ({name})")
+        return network

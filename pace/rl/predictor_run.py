@@ -17,7 +17,8 @@ from omegaconf import DictConfig
 from pace.config.base import ConfigError, parse, to_dict
 from pace.config.training import TrainConfig
 from pace.devices import resolve_device
-from pace.predictor.network import PredictorNetwork
+from pace.predictor.network import make_predictor
+from pace.predictor.priors import resolve_priors
 from pace.predictor.regression import PredictorTrainer
 from pace.rl.practice import ServePractice
 from pace.runs.checkpoint import FOLDER, Checkpoint, save_checkpoint
@@ -37,8 +38,9 @@ class PredictorRun:
             raise ConfigError("predictor.enabled is false: there is nothing to train")
         device = resolve_device(config.device)
         torch.manual_seed(config.seed)
+        config.predictor = resolve_priors(config)
         self.config = config
-        self.network = PredictorNetwork(config.predictor).to(device)
+        self.network = make_predictor(config.predictor).to(device)
         self.practice = ServePractice(config, device)
         self.practice.spread()
         self.trainer = PredictorTrainer(self.network, config.predictor, config.algo.steps, config.num_worlds)

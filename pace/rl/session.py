@@ -16,10 +16,12 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from pace.config.base import ConfigError, parse, to_dict
+from pace.config.predictor import PredictorPriors
 from pace.config.training import RESUME_KEYS, TrainConfig
 from pace.devices import resolve_device, threads_of
 from pace.distributed import Team, own_device, suitable_size, team_of
-from pace.predictor.network import PredictorNetwork
+from pace.predictor.network import BallPredictor, make_predictor
+from pace.predictor.priors import resolve_priors
 from pace.rl.curriculum import Curriculum
 from pace.rl.policies import locate
 from pace.rl.trainer import Summary, Trainer, begins_anew, played_on
@@ -83,8 +85,9 @@ def build_trainer(config: TrainConfig, saved: Checkpoint | None, device: torch.d
     if config.num_worlds % team.size:
         raise ConfigError(f"num_worlds {config.num_worlds} cannot be shared equally by {team.size} processes")
     start = first_weights(config)
+    config.predictor = resolve_priors(config, learned_priors(start) if start else None)
     torch.manual_seed(config.seed)
-    predictor = PredictorNetwork(config.predictor).to(device)
+    predictor = make_predictor(config.predictor).to(device)
     anew = saved is not None and begins_anew(saved, team, device)
     again = int(saved.counters["updates"]) if saved and anew else 0  # or the run's beginning would be drawn once more
     make = partial(make_worlds, device=device, team=team, predictor=predictor, again=again)
@@ -100,7 +103,7 @@ def build_trainer(config: TrainConfig, saved: Checkpoint | None, device: torch.d
 
 
 def make_worlds(
-    task: TrainConfig, stage: int, device: torch.device, team: Team, predictor: PredictorNetwork, again: int = 0
+    task: TrainConfig, stage: int, device: torch.device, team: Team, predictor: BallPredictor, again: int = 0
 ) -> TableTennisEnv:
     """This process's worlds of one stage of the curriculum; each stage draws from random numbers of its own.
 
@@ -127,7 +130,13 @@ def first_weights(config: TrainConfig) -> Checkpoint | None:
         raise CheckpointError(f"{given.path} has no predictor: give predictor_from a run of pace predictor")
     if start is None:
         return replace(given, weights={"predictor": given.weights["predictor"]})
-    return replace(start, weights=start.weights | {"predictor": given.weights["predictor"]})
+    task = start.config | {"predictor": given.config["predictor"]}
+    return replace(start, config=task, weights=start.weights | {"predictor": given.weights["predictor"]})
+
+
+def learned_priors(start: Checkpoint) -> PredictorPriors:
+    """The priors that belong to the predictor's weights in ``start``."""
+    return parse(start.config["predictor"]["priors"], PredictorPriors)
 
 
 def open_run(config: TrainConfig, first_update: int) -> RunFolder:
@@ -142,13 +151,9 @@ def announce(trainer: Trainer, run: RunFolder, saved: Checkpoint | None) -> None
         anew = ", with worlds that begin anew" if begins_anew(saved, trainer.team, trainer.device) else ""
         print(f"going on from {saved.path}{anew}")
     shared = f" in {trainer.team.size} processes" if trainer.team.size > 1 else ""
-    agent = trainer.agent
-    number_format = str(agent.observation_dtype).removeprefix("torch.")
-    if agent.observation_dtype != torch.float32 and agent.fp32_below > 0.0:
-        number_format += f" (float32 below a std of {agent.fp32_below:g})"
     print(
         f"training {trainer.config.name}: {trainer.config.num_worlds} worlds on {trainer.device}{shared}, "
-        f"networks in {number_format}, run folder {run.path}",
+        f"{trainer.algorithm.describe()}, run folder {run.path}",
         flush=True,
     )
 

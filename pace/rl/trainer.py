@@ -14,12 +14,12 @@ from torch import Tensor, nn
 from pace.config.base import ConfigError, to_dict
 from pace.config.training import TrainConfig
 from pace.distributed import Team
-from pace.predictor.network import PredictorNetwork
+from pace.predictor.network import BallPredictor
 from pace.predictor.regression import PredictorSource, PredictorTrainer
-from pace.rl.agent import Agent
+from pace.rl.agent import Sizes
+from pace.rl.algorithm import ALGORITHMS
 from pace.rl.curriculum import Curriculum
-from pace.rl.ppo import PPO
-from pace.rl.rollout import Rollout, RolloutError, VectorTask
+from pace.rl.rollout import RolloutError, VectorTask
 from pace.runs.checkpoint import (
     FOLDER,
     Checkpoint,
@@ -35,6 +35,7 @@ from pace.runs.run_folder import RunFolder, plot_learning_curve
 
 CHECKPOINTS_KEPT = 4
 LAST_GOOD = "last_good"  # folder in the run: the weights before an update that failed
+LEARNER, OLD_LEARNER = "algorithm", "ppo"  # part of a checkpoint's training state, and what it was called once
 COUNTS = ("serves", "hits", "successes", "falls", "episodes", "steps", "reward_sum")
 
 
@@ -74,18 +75,19 @@ class Summary:
 
 
 class Trainer:
-    """Trains the policy, the critic and the predictor of ``config`` on ``env`` and keeps the run's files.
+    """Trains the agent and the predictor of ``config`` on ``env`` and keeps the run's files.
 
-    ``predictor`` is the network that ``env`` predicts with; it is trained in place. ``env`` holds this process's
-    worlds; the processes of a ``team`` each have a trainer, go through every method together, and the leader has the
-    ``run``. A ``curriculum`` gives other worlds where another of its stages begins.
+    How the agent acts and learns is the ``algorithm``'s part (``config.algo.algorithm``). ``predictor`` is the network
+    that ``env`` predicts with; it is trained in place. ``env`` holds this process's worlds; the processes of a ``team``
+    each have a trainer, go through every method together, and the leader has the ``run``. A ``curriculum`` gives other
+    worlds where another of its stages begins.
     """
 
     def __init__(
         self,
         config: TrainConfig,
         env: TrainableTask,
-        predictor: PredictorNetwork,
+        predictor: BallPredictor,
         run: RunFolder | None,
         team: Team | None = None,
         curriculum: Curriculum[Any] | None = None,
@@ -95,11 +97,9 @@ class Trainer:
         self.team = team = team or Team()
         self.device = env.policy_observation.device
         self.num_worlds, policy_size = env.policy_observation.shape
-        critic_size = env.critic_observation.shape[1]
-        self.agent = Agent(policy_size, critic_size, env.action_spec.shape[-1], config.algo, self.device)
+        sizes = Sizes(policy_size, env.critic_observation.shape[1], env.action_spec.shape[-1])
+        self.algorithm = ALGORITHMS[config.algo.algorithm](sizes, config.algo, self.device, team)
         team.follow_([tensor for _, module in self._networks() for tensor in module.state_dict().values()])
-        self.ppo = PPO(self.agent, config.algo, team)
-        self.rollout = Rollout(env, self.agent, config.algo.steps)
         self.regression = PredictorTrainer(predictor, config.predictor, config.algo.steps, self.num_worlds, team)
         self.updates, self.samples, self.wall_s = 0, 0, 0.0
         self._stop = StopRequest()
@@ -156,14 +156,19 @@ class Trainer:
             raise RolloutError(f"{error}; the weights before this update are in {folder}") from error
 
     def _networks(self) -> tuple[tuple[str, nn.Module], ...]:
-        return (("agent", self.agent), ("predictor", self.predictor))
+        return (("agent", self.algorithm.agent), ("predictor", self.predictor))
 
     def _counters(self) -> dict[str, float]:
         return {"updates": self.updates, "samples": self.samples, "wall_s": self.wall_s}
 
     @property
+    def agent(self) -> nn.Module:
+        """All that the algorithm learns."""
+        return self.algorithm.agent
+
+    @property
     def _samples_per_update(self) -> int:
-        return self.team.size * self.num_worlds * self.rollout.steps
+        return self.team.size * self.num_worlds * self.regression.steps
 
     def _move_on(self) -> None:
         """The next stage's worlds, where one begins; after an update, so that a checkpoint has what comes next."""
@@ -171,30 +176,12 @@ class Trainer:
             self.env.warn_of_overflow()
             self.env = self.curriculum.worlds
 
-    def _fit_storage(self) -> None:
-        """Room for the present worlds, the steps of the next update (``algo.later_steps``), and its number format."""
-        steps = self.config.algo.steps_at(self.samples)
-        self.agent.choose_dtype()
-        fits = steps == self.rollout.steps and self.rollout.policy.dtype == self.agent.observation_dtype
-        if not fits or self.env is not self.rollout.env:
-            self.rollout = Rollout(self.env, self.agent, steps)
-            self.regression.resize(steps)
-
     def update(self) -> dict[str, float]:
         """One rollout and what is learned from it; returns the row of metrics, without the times."""
-        self._fit_storage()
-        norms = (self.agent.policy_norm, self.agent.critic_norm)
-        before = [norm.moments() for norm in norms]
-        self.rollout.begin()
-        for t in range(self.rollout.steps):
-            self.regression.record(t, self.env)
-            self.rollout.step(t)
-        self.rollout.finish(self.config.algo.gamma, self.config.algo.gae_lambda)
+        self._play()
         self._require_no_fault()
-        for norm, moments in zip(norms, before, strict=True):
-            norm.pool(moments, self.team)
         prediction = self.regression.update()
-        learning = self.ppo.update(self.rollout, self.samples)
+        learning = self.algorithm.update(self.samples)
         self.samples += self._samples_per_update
         self.updates += 1
         task = summarise(self.env.pop_statistics(), self.config.robot.control_dt, self.team)
@@ -203,9 +190,20 @@ class Trainer:
         self._move_on()
         return {"update": self.updates, "samples": self.samples, **task, **prediction, **learning}
 
+    def _play(self) -> None:
+        """One rollout, recorded for the predictor."""
+        steps = self.algorithm.prepare(self.env, self.samples)
+        if steps != self.regression.steps:
+            self.regression.resize(steps)
+        self.algorithm.begin()
+        for t in range(steps):
+            self.regression.record(t, self.env)
+            self.algorithm.step(t)
+        self.algorithm.finish()
+
     def _require_no_fault(self) -> None:
         """Errors: :class:`RolloutError`, in every process, when the rollout of one of them cannot be learned from."""
-        faults = [fault for fault in self.team.gather(self.rollout.fault()) if fault is not None]
+        faults = [fault for fault in self.team.gather(self.algorithm.fault()) if fault is not None]
         if faults:
             raise RolloutError(faults[0])
 
@@ -241,7 +239,7 @@ class Trainer:
             counters=self._counters(),
             weights={part: module.state_dict() for part, module in self._networks()},
             training={
-                "ppo": self.ppo.state_dict(),
+                LEARNER: self.algorithm.state_dict(),
                 "regression": self.regression.state_dict(),
                 "processes": self.team.gather(own),
             },
@@ -260,13 +258,12 @@ class Trainer:
                 load_weights(module, checkpoint.weights[part], f"{checkpoint.path} ({part}{cure})")
 
     def start_from(self, checkpoint: Checkpoint) -> None:
-        """:meth:`load_weights`, with the spread that this run begins with.
+        """:meth:`load_weights`, for a new run.
 
         Errors: those of :meth:`load_weights`.
         """
         self.load_weights(checkpoint)
-        self.agent.actor.bound_std(self.config.algo.std_floor, self.config.algo.std[0].value)
-        self.agent.choose_dtype()
+        self.algorithm.weights_loaded(new_run=True)
 
     def resume(self, checkpoint: Checkpoint) -> None:
         """Go on exactly where ``checkpoint`` was written.
@@ -280,9 +277,9 @@ class Trainer:
         if state is None:
             raise CheckpointError(f"{checkpoint.path} holds weights only: use init_from instead of resume")
         self.load_weights(checkpoint)
-        self.agent.choose_dtype()
+        self.algorithm.weights_loaded(new_run=False)
         try:
-            self.ppo.load_state_dict(state["ppo"])
+            self.algorithm.load_state_dict(state[LEARNER if LEARNER in state else OLD_LEARNER])
             self.regression.load_state_dict(state["regression"])
             if not begins_anew(checkpoint, self.team, self.device):
                 self._resume_play(state["processes"][self.team.rank])

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
@@ -19,8 +19,8 @@ from typing import IO
 from tqdm import tqdm
 
 from pace.command import quote
-from pace.config.base import ConfigError, to_dict
-from pace.config.training import RESUME_KEYS, load_train_config
+from pace.config.base import ConfigError, parse, to_dict
+from pace.config.training import RESUME_KEYS, TrainConfig, load_train_config
 from pace.runs.checkpoint import list_checkpoints, read_meta
 from pace.runs.interrupt import StopRequest
 from pace.runs.progress import SECONDS_PER_LINE, clock
@@ -65,7 +65,8 @@ class Run:
         """Of ``python -m pace.rl.train``, to begin the run or to go on with it."""
         limits = [f"samples={self.samples}", "minutes=0", "progress=false"]
         if list_checkpoints(self.folder):
-            return [f"resume={quote(str(self.folder))}", *limits]
+            modules = ",".join(load_train_config(list(self.overrides)).plugins)
+            return [f"resume={quote(str(self.folder))}", *([f"plugins=[{modules}]"] if modules else []), *limits]
         return [*self.overrides, f"out={quote(str(self.folder))}", *limits]
 
 
@@ -78,11 +79,18 @@ def check_settings(run: Run) -> None:
     checkpoints = list_checkpoints(run.folder)
     if not checkpoints:
         return
-    there = _flat(read_meta(checkpoints[-1])["config"])
+    saved = read_meta(checkpoints[-1])["config"]
+    there = _flat(to_dict(parse(saved, TrainConfig)))
     for key in sorted(set(asked) | set(there)):
-        if key.split(".")[0] not in FREE_KEYS and asked.get(key) != there.get(key):
+        if not _is_free(key, asked) and asked.get(key) != there.get(key):
             what = f"{key} {there.get(key)}, and {asked.get(key)} is asked for"
             raise ConfigError(f"{run.folder} was trained with {what}: give another out=")
+
+
+def _is_free(key: str, asked: Mapping[str, object]) -> bool:
+    """Whether a run may differ in ``key`` from what is asked for. A run saves the priors that it has derived."""
+    derived = "predictor.priors" in asked and key.startswith("predictor.priors")
+    return derived or key.split(".")[0] in FREE_KEYS
 
 
 def _flat(tree: dict, prefix: str = "") -> dict:

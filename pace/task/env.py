@@ -79,6 +79,8 @@ class TableTennisEnv(EnvBase):
     On a GPU a step and a reset are a CUDA graph each (:class:`pace.arrays.graph.CapturedCall`; ``engine.graph``): the
     configuration and the predictor's tensors are those of the second step, and are changed in place or not at all.
 
+    A task whose reward has no terms (:func:`pace.config.overrides.without_reward`) pays 0.
+
     Args:
         config: the task.
         num_worlds: N.
@@ -290,7 +292,7 @@ class TableTennisEnv(EnvBase):
         ``reward_sum`` and ``reward/<term>`` as the learner sees them."""
         terms = self.rewards.pop_sums()
         sums = self.statistics.pop()
-        sums["reward_sum"] = torch.stack(list(terms.values())).sum()
+        sums["reward_sum"] = torch.stack(list(terms.values())).sum() if terms else torch.zeros_like(self.reward[0])
         return sums | {f"reward/{name}": value for name, value in terms.items()}
 
     def _parts(self) -> dict[str, Stateful]:

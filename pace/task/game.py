@@ -62,6 +62,7 @@ class Game(GameState, Stateful):
     def __init__(self, config: TaskConfig, ball: BallSim, base_position: Tensor) -> None:
         count, device = ball.num_worlds, ball.device
         super().__init__(**vars(allocate(GameState, count, device)))
+        self.landing_target = (config.landing_target[0], config.landing_target[1])
         self.rules = rules_of(config)
         self.idle_point = torch.tensor(idle_point(config.reward), device=device)
         for goal in (self.target.apex, self.target.point):

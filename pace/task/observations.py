@@ -4,6 +4,9 @@ The functions of :data:`POLICY` take :class:`ActorSignals`, which holds nothing 
 can compute from them; those of :data:`CRITIC` take :class:`TaskState`, the truth. So the actor cannot see the
 truth by accident: a privileged name in the policy's list is a configuration error.
 
+Both tables take observations from outside (:mod:`pace.config.plugins`): in the list of names, an entry point or the
+import path of an :class:`ActorObservation` or :class:`CriticObservation`. The type tells for whom it is.
+
 A group's observation (N, H * D) is its last H frames of D numbers, oldest first. At reset of a world all H frames are
 the current one.
 """
@@ -11,7 +14,7 @@ the current one.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeVar
 
 import torch
 import warp as wp
@@ -19,6 +22,7 @@ from torch import Tensor
 
 from pace.arrays.share import record, share
 from pace.config.base import ConfigError
+from pace.config.plugins import CRITIC_OBSERVATIONS, OBSERVATIONS, Registry
 from pace.config.task import OBSERVED_FROM, ObservationConfig, PredictorConfig, ReturnMemoryConfig
 from pace.onboard.attitude import AttitudeEstimate
 from pace.onboard.delay import DelayEstimate
@@ -237,8 +241,22 @@ def _column(values: Tensor) -> Tensor:
     return values.unsqueeze(-1)
 
 
+Observation = TypeVar("Observation", ActorObservation, CriticObservation)
+
+
+def _only(kind: type[Observation]) -> Callable[[object], Observation]:
+    def accept(found: object) -> Observation:
+        if isinstance(found, kind):
+            return found
+        privileged = " (privileged: for the critic alone)" if isinstance(found, CriticObservation) else ""
+        raise TypeError(f"must be of type {kind.__name__}, not {type(found).__name__}{privileged}")
+
+    return accept
+
+
 #: What the actor can see: sensed, delayed, noisy signals, and what is computed from them.
-POLICY: dict[str, ActorObservation] = {
+POLICY: Registry[ActorObservation] = Registry("name", OBSERVATIONS, _only(ActorObservation))
+POLICY |= {
     "base_angular_velocity": ActorObservation(3, lambda s: s.sensing.base_angular_velocity),
     "base_position": ActorObservation(3, lambda s: s.sensing.base_position),
     "projected_gravity": ActorObservation(3, lambda s: s.sensing.projected_gravity),
@@ -262,7 +280,8 @@ POLICY: dict[str, ActorObservation] = {
 }
 
 #: What the critic can see: the truth.
-CRITIC: dict[str, CriticObservation] = {
+CRITIC: Registry[CriticObservation] = Registry("name", CRITIC_OBSERVATIONS, _only(CriticObservation))
+CRITIC |= {
     "base_angular_velocity": CriticObservation(3, lambda s: s.robot.base_angular_velocity),
     "base_position": CriticObservation(3, lambda s: s.robot.base_position),
     "projected_gravity": CriticObservation(3, lambda s: s.robot.projected_gravity),
@@ -315,9 +334,13 @@ def check_critic(names: list[str]) -> None:
 
 def _check_names(group: str, names: list[str], table: Table) -> None:
     for name in names:
-        if name not in table:
-            hint = " (privileged: for the critic alone)" if name in CRITIC else ""
-            raise ConfigError(f"observation.{group}: unknown name '{name}'{hint}; known: {', '.join(table)}")
+        if name not in table and name in CRITIC:
+            what = "privileged: for the critic alone"
+            raise ConfigError(f"observation.{group}: unknown name '{name}' ({what}); known: {', '.join(table)}")
+        try:
+            table[name]
+        except ConfigError as error:
+            raise ConfigError(f"observation.{group}: {error}") from error
 
 
 def layout(names: list[str], table: Table) -> dict[str, slice]:

@@ -1,7 +1,8 @@
 """Reward terms: small pure functions ``(state, params) -> Tensor (N,)`` in a table from name to function.
 
 Weights and parameters live in ``configs/reward/``. :class:`RewardManager` checks names, parameters and shapes, and sums
-``scale * weight * control_dt * value``; that holds for one-off terms too.
+``scale * weight * control_dt * value``; that holds for one-off terms too. A term may come from outside of the package
+(:mod:`pace.config.plugins`): ``+reward.terms.mine={weight: 1.0, function: my_module:my_term}``, or an entry point.
 """
 
 from __future__ import annotations
@@ -9,14 +10,15 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor
 
 from pace.arrays.state import Stateful
 from pace.config.base import ConfigError
-from pace.config.task import RewardConfig
+from pace.config.plugins import REWARD_TERMS, Registry
+from pace.config.task import RewardConfig, RewardTerm
 from pace.sim.ball.aero import GRAVITY
 from pace.sim.ball.ball import BallParams
 from pace.task.state import TaskState
@@ -26,21 +28,31 @@ Term = Callable[[TaskState, Params], Tensor]
 
 
 class RewardFunction(NamedTuple):
-    """A term and the names of the parameters that it needs."""
+    """A term and the names of the parameters that it needs; ``None``: whichever the configuration gives it."""
 
     function: Term
-    params: tuple[str, ...]
+    params: tuple[str, ...] | None
+
+
+def _accept(found: object) -> RewardFunction:
+    """What an import path or an entry point named: a function of :data:`TERMS`, any other, or a RewardFunction."""
+    if isinstance(found, RewardFunction):
+        return found
+    if not callable(found):
+        raise TypeError("a reward term is a function of (state, params)")
+    entered = (entry for entry in TERMS.values() if entry.function is found)
+    return next(entered, RewardFunction(cast(Term, found), None))
 
 
 #: All terms by name.
-TERMS: dict[str, RewardFunction] = {}
+TERMS: Registry[RewardFunction] = Registry("reward term", REWARD_TERMS, _accept, where="reward.terms.")
 
 
 def term(*params: str) -> Callable[[Term], Term]:
-    """Enter a function into :data:`TERMS` under its own name."""
+    """Enter a function into :data:`TERMS` under its own name, which must be free."""
 
     def enter(function: Term) -> Term:
-        TERMS[function.__name__] = RewardFunction(function, params)
+        TERMS.enter(function.__name__, RewardFunction(function, params))
         return function
 
     return enter
@@ -138,12 +150,15 @@ def paddle_speed(arriving: Tensor, normal: Tensor, change: Tensor, material: Bal
 # --- after the hit ----------------------------------------------------------------------------------------------------
 
 
-@term("offset", "x", "y")
+@term("offset")
 def predicted_landing(state: TaskState, params: Params) -> Tensor:
-    """Once, at the hit: offset minus the distance of the forecast landing to (x, y), m; 0 without a landing."""
-    landing = state.game.returns.landing
+    """Once, at the hit: offset minus the distance of the forecast landing to the task's ``landing_target``, m.
+
+    0 without a landing.
+    """
+    (x, y), landing = state.game.landing_target, state.game.returns.landing
     paid = state.game.referee.hit_now & landing[:, 0].isfinite()
-    distance = torch.hypot(landing[:, 0] - params["x"], landing[:, 1] - params["y"])
+    distance = torch.hypot(landing[:, 0] - x, landing[:, 1] - y)
     return torch.where(paid, params["offset"] - distance, 0.0)
 
 
@@ -357,7 +372,7 @@ class _Entry:
 
 
 class RewardManager(Stateful):
-    """Computes the reward of N worlds and keeps each term's sum.
+    """Computes the reward of N worlds and keeps each term's sum. Without a term the reward is 0.
 
     Attributes: ``names`` of the T terms, ``values`` (T, N) unweighted, ``reward`` (N,) as the learner sees it,
     ``sums`` (T,) of the weighted terms over worlds and steps since the last :meth:`pop_sums`.
@@ -368,9 +383,8 @@ class RewardManager(Stateful):
     STATE = ("_weights", "values", "reward", "sums")
 
     def __init__(self, config: RewardConfig, num_worlds: int, device: torch.device, control_dt: float) -> None:
-        for name, entry in config.terms.items():
-            check_term(name, entry.params)
-        self._entries = [_Entry(name, TERMS[name].function, entry.params) for name, entry in config.terms.items()]
+        found = {name: find_term(name, entry) for name, entry in config.terms.items()}
+        self._entries = [_Entry(name, function, config.terms[name].params) for name, function in found.items()]
         self.names = tuple(config.terms)
         weights = [entry.weight * control_dt * config.scale for entry in config.terms.values()]
         self._weights = torch.tensor(weights, dtype=torch.float32, device=device)
@@ -385,6 +399,8 @@ class RewardManager(Stateful):
             if value.shape != self.reward.shape:
                 wanted = tuple(self.reward.shape)
                 raise ValueError(f"reward term '{entry.name}' has shape {tuple(value.shape)}, not {wanted}")
+        if not values:
+            return
         torch.stack(values, out=self.values)
         torch.mv(self.values.T, self._weights, out=self.reward)
         self.sums.addcmul_(self.values.sum(1), self._weights)
@@ -396,14 +412,20 @@ class RewardManager(Stateful):
         return popped
 
 
-def check_term(name: str, params: Params) -> None:
-    """Raise :class:`ConfigError` unless ``name`` is a term and ``params`` are exactly its parameters."""
-    if name not in TERMS:
-        raise ConfigError(f"unknown reward term 'reward.terms.{name}'; known: {', '.join(sorted(TERMS))}")
-    missing = set(TERMS[name].params) - set(params)
-    unknown = set(params) - set(TERMS[name].params)
-    if missing or unknown:
+def find_term(name: str, entry: RewardTerm) -> Term:
+    """Function of the term that the configuration calls ``name``: ``entry.function``, or the one of that name.
+
+    Errors: :class:`ConfigError` for an unknown one, and unless ``entry.params`` are exactly its parameters.
+    """
+    try:
+        function, needed = TERMS[entry.function or name]
+    except ConfigError as error:
+        raise ConfigError(f"reward.terms.{name}.function: {error}" if entry.function else str(error)) from error
+    params = entry.params
+    if needed is not None and set(needed) != set(params):
+        missing, unknown = set(needed) - set(params), set(params) - set(needed)
         what = f"misses {sorted(missing)}" if missing else f"does not know {sorted(unknown)}"
-        raise ConfigError(f"reward.terms.{name}.params {what}; it needs {list(TERMS[name].params)}")
+        raise ConfigError(f"reward.terms.{name}.params {what}; it needs {list(needed)}")
     if not params.get("sigma", 1.0) > 0:
         raise ConfigError(f"reward.terms.{name}.params.sigma must be positive, got {params['sigma']}")
+    return function

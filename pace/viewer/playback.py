@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pace.config.overrides import ON_A_CPU, override_task
+from pace.config.overrides import ON_A_CPU, override_task, without_reward
 from pace.config.task import TaskConfig
 from pace.rl.policies import TaskPolicy
 from pace.sim.ball.ball import BallParams, BallSim
@@ -189,7 +189,7 @@ class Show:
     def __init__(self, policy: TaskPolicy, overrides: Sequence[str] = (), seed: int = 1) -> None:
         self.policy = policy.to("cpu")
         config = override_task(policy.config, [*SHOW_OVERRIDES, *overrides, "serve.serves_per_episode=0"])
-        self.env = ShowEnv(config, 1, "cpu", seed, policy.predictor)
+        self.env = ShowEnv(without_reward(config), 1, "cpu", seed, policy.predictor)
         self.score = Score()
         self.flights = 0
         self._line = FlightLine(config)

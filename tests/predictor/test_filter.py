@@ -7,12 +7,14 @@ import torch
 from torch import Tensor
 
 from pace.config.base import ConfigError, compose, parse
+from pace.config.predictor import PredictorPriors
 from pace.config.training import TrainConfig, load_train_config
-from pace.predictor.filter import CONTACT_HEIGHT, FALL, RISE, FlightFilter, rebound, solve
+from pace.predictor.filter import CONTACT_HEIGHT, FlightFilter, rebound, solve
 from pace.predictor.network import PredictorNetwork
 from pace.rl.practice import ServePractice
 
 WINDOW = 45
+PRIORS = PredictorPriors()
 DT = 0.02  # s
 
 
@@ -21,7 +23,7 @@ def flights(count: int, frames: int) -> tuple[Tensor, Tensor, Tensor]:
     generator = torch.Generator().manual_seed(3)
     start = torch.tensor([1.35, 0.0, 1.03]).expand(count, 3)
     velocity = torch.tensor([-5.75, -0.2, 1.75]) + 0.2 * (torch.rand(count, 3, generator=generator) - 0.5)
-    fall, rise = torch.tensor(FALL[0]), torch.tensor(RISE[0])
+    fall, rise = torch.tensor(PRIORS.fall.mean), torch.tensor(PRIORS.rise.mean)
     drop = velocity[:, 2:].square() - 2 * fall[2] * (start[:, 2:] - CONTACT_HEIGHT)
     bounce = (-velocity[:, 2:] - drop.sqrt()) / fall[2]
     place = start + bounce * velocity + 0.5 * bounce**2 * fall
@@ -39,7 +41,7 @@ def flights(count: int, frames: int) -> tuple[Tensor, Tensor, Tensor]:
 @pytest.mark.parametrize("frames", [6, 15, 21, 27, 33])
 def test_it_is_exact_on_its_own_flights(frames: int) -> None:
     window, bounce, apex = flights(50, frames)
-    found = FlightFilter(WINDOW)(window)
+    found = FlightFilter(WINDOW, PRIORS)(window)
     torch.testing.assert_close(found.age, torch.full((50, 1), DT * (frames - 1)))
     torch.testing.assert_close(DT * (frames - 1) - found.bounce_age[:, 0], bounce, atol=2e-3, rtol=0)
     early = 0.06 if frames < 10 else 0.005  # few frames leave the priors' means of the velocity
@@ -62,7 +64,7 @@ def practice(*overrides: str) -> ServePractice:
 def test_it_finds_bounce_and_apex_of_the_tasks_flights() -> None:
     """Under the paper's noise and delay: the bounce within 3 ms, the apex within 4.5 cm before any learning."""
     serves = practice("randomization=none", "ball=paper")
-    flight_filter, bounced_at = FlightFilter(WINDOW), torch.full((256,), torch.nan)
+    flight_filter, bounced_at = FlightFilter(WINDOW, PRIORS), torch.full((256,), torch.nan)
     for step in range(1, 35):
         serves.advance()
         bounce = serves.ball.events.own_bounce > 0

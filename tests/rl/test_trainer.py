@@ -16,7 +16,8 @@ from omegaconf import OmegaConf
 from pace.config.base import ConfigError, parse, to_dict
 from pace.config.training import SchedulePoint, TrainConfig, load_train_config
 from pace.predictor.network import PredictorNetwork
-from pace.rl.rollout import RolloutError
+from pace.rl.ppo import AsymmetricPPO
+from pace.rl.rollout import Rollout, RolloutError
 from pace.rl.trainer import Trainer, summarise
 from pace.runs.checkpoint import CheckpointError, list_checkpoints, load_checkpoint
 from pace.runs.metrics import read_metrics
@@ -57,6 +58,17 @@ def make_trainer(path: Path, updates: int = 2, resume: bool = False, **changes: 
     if saved:
         trainer.resume(saved)
     return trainer
+
+
+def learner(trainer: Trainer) -> AsymmetricPPO:
+    assert isinstance(trainer.algorithm, AsymmetricPPO)
+    return trainer.algorithm
+
+
+def stored(trainer: Trainer) -> Rollout:
+    rollout = learner(trainer).rollout
+    assert rollout is not None
+    return rollout
 
 
 def all_weights(trainer: Trainer) -> dict[str, torch.Tensor]:
@@ -114,11 +126,11 @@ def test_a_spread_that_may_rise_resumes_as_it_was(tmp_path: Path) -> None:
 
     first, second = trainer(), trainer()
     with torch.no_grad():
-        first.agent.actor.spread.state_independent_scale.fill_(math.log(0.8))
+        learner(first).agent.actor.spread.state_independent_scale.fill_(math.log(0.8))
     second.resume(first.checkpoint())
-    assert second.agent.actor.std[0].item() == pytest.approx(0.8)
+    assert learner(second).agent.actor.std[0].item() == pytest.approx(0.8)
     second.start_from(first.checkpoint())  # a new run begins with its own
-    assert second.agent.actor.std[0].item() == pytest.approx(0.5)
+    assert learner(second).agent.actor.std[0].item() == pytest.approx(0.5)
 
 
 def test_later_updates_can_be_longer_and_resume_exactly(tmp_path: Path) -> None:
@@ -133,7 +145,7 @@ def test_later_updates_can_be_longer_and_resume_exactly(tmp_path: Path) -> None:
     assert read_metrics(tmp_path / "whole" / "metrics.csv")["samples"] == [
         UPDATE, 2 * UPDATE, 2 * UPDATE + longer, 2 * UPDATE + 2 * longer
     ]  # fmt: skip
-    assert whole.rollout.steps == whole.regression.steps == 18
+    assert stored(whole).steps == whole.regression.steps == 18
     later(tmp_path / "parts", 2 * UPDATE + longer)
     resumed = later(tmp_path / "parts", 2 * UPDATE + 2 * longer, resume=True)
     expected, found = all_weights(whole), all_weights(resumed)
@@ -151,12 +163,12 @@ def test_a_run_changes_to_float32_when_its_spread_is_small_and_resumes_exactly(
     def narrowing(path: Path, updates: int, resume: bool = False) -> Trainer:
         algo = replace(make_config().algo, autocast="auto", fp32_below=0.2, std=std)
         trainer = make_trainer(path, updates, resume, algo=algo)
-        assert trainer.agent.observation_dtype == (torch.float32 if resume else torch.bfloat16)
+        assert learner(trainer).agent.observation_dtype == (torch.float32 if resume else torch.bfloat16)
         trainer.train()
         return trainer
 
     whole = narrowing(tmp_path / "whole", 5)
-    assert whole.rollout.policy.dtype == torch.float32
+    assert stored(whole).policy.dtype == torch.float32
     narrowing(tmp_path / "parts", 4)
     resumed = narrowing(tmp_path / "parts", 5, resume=True)
     expected, found = all_weights(whole), all_weights(resumed)
@@ -238,7 +250,7 @@ def test_init_from_takes_the_weights_and_nothing_else(tmp_path: Path) -> None:
     assert new.samples == 0
     expected, found = all_weights(old), all_weights(new)
     assert all(torch.equal(expected[name], found[name]) for name in expected)
-    assert not new.ppo.actor_optimiser.state
+    assert not learner(new).ppo.actor_optimiser.state
 
 
 def test_weights_of_another_size_are_refused(tmp_path: Path) -> None:

@@ -1,0 +1,89 @@
+"""The learned predictor: its configuration, and what it takes for granted about serves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+
+from pace.config import plugins
+from pace.config.base import require
+
+COUNTED_FRAMES = 5  # the last positions that ``predictor.features=counted`` sees
+
+
+FEATURES = ("steps", "counted", "flight")
+
+
+FRAME_DT = 0.02  # s, between the positions that ``predictor.features=flight`` fits
+
+
+@dataclass
+class Prior:
+    """What a quantity usually is, and how much it differs: mean (centre) and standard deviation (scale), by axis."""
+
+    mean: list[float]
+    std: list[float]
+
+    def __post_init__(self) -> None:
+        require(len(self.mean) == len(self.std), f"predictor.priors: {len(self.mean)} means, {len(self.std)} stds")
+        require(min(self.std, default=1.0) > 0, f"predictor.priors: a std must be positive, got {self.std}")
+
+
+@dataclass
+class PredictorPriors:
+    """What the predictor takes for granted about serves (world frame; x, y, z): the scales of its numbers.
+
+    A network's weights belong to the priors that it was trained with, which are therefore saved with it. The defaults
+    were measured on the released training serves; :mod:`pace.predictor.priors` carries them over to other ones. Saved
+    predictors that do not name theirs were trained with these.
+    """
+
+    # of the fit (features=flight): the launch, whose position is seen; both accelerations, of drag 4 m/s^2 at 6 m/s
+    launch_velocity: Prior = field(default_factory=lambda: Prior([-5.75, -0.2, 1.75], [0.6, 0.5, 0.25]))  # m/s
+    fall: Prior = field(default_factory=lambda: Prior([4.0, 0.0, -9.8], [0.8, 0.2, 0.3]))  # m/s^2, before the bounce
+    rise: Prior = field(default_factory=lambda: Prior([2.0, 0.0, -10.4], [0.4, 0.2, 0.4]))  # m/s^2, after it
+    # what the fit finds: velocities before and after the bounce, and where it bounces
+    fall_velocity: Prior = field(default_factory=lambda: Prior([-5.2, -0.2, -0.5], [0.5, 0.35, 1.5]))  # m/s
+    rise_velocity: Prior = field(default_factory=lambda: Prior([-4.1, -0.15, 2.6], [0.5, 0.3, 0.25]))  # m/s
+    bounce: Prior = field(default_factory=lambda: Prior([-1.0, -0.1, 0.78], [0.25, 0.2, 0.02]))  # m
+    # a serve crosses the table (|x| <= 1.37, |y| <= 0.76) between its top and about 0.5 m above it
+    position: Prior = field(default_factory=lambda: Prior([0.0, 0.0, 1.0], [1.0, 0.4, 0.25]))  # m
+    # between two frames (20 ms), in which serves differ by a few centimetres
+    step: Prior = field(default_factory=lambda: Prior([-0.11, 0.0, 0.0], [0.02, 0.02, 0.03]))  # m
+    # outputs: the apex lies at or behind the robot's end of the table
+    apex: Prior = field(default_factory=lambda: Prior([-1.5, 0.0, 1.0], [0.3, 0.25, 0.12]))  # m
+    target: Prior = field(default_factory=lambda: Prior([-1.6, 0.0, 1.0], [0.25, 0.25, 0.15]))  # m
+    target_time: Prior = field(default_factory=lambda: Prior([0.3], [0.25]))  # s
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            size = 1 if f.name == "target_time" else 3
+            require(len(getattr(self, f.name).mean) == size, f"predictor.priors.{f.name} needs {size} numbers each")
+
+
+@dataclass
+class PredictorConfig:
+    """The learned predictor of the ball's apex and its online regression."""
+
+    name: str
+    frames: int  # past ball positions it sees
+    hidden: list[int]
+    learning_rate: float
+    batch_size: int
+    batches_per_update: int
+    train_updates: int  # frozen afterwards; 0 trains it to the end
+    outputs: list[str]  # of apex (3), target (3), target_time (1)
+    enabled: bool  # off: the actor sees zeros instead (ablation)
+    features: str = "steps"  # steps (positions alone), counted (the last five, and how many there were before them) or
+    # flight (a fit of the whole flight), which both need many frames; or from outside: my_module:MyPredictor
+    priors: PredictorPriors | None = None  # null: derived from the serve when a run starts, and saved with it
+
+    def __post_init__(self) -> None:
+        known = self.features in FEATURES or plugins.may_be_outside(plugins.PREDICTORS, self.features)
+        wanted = "steps, counted or flight, or come from a module named in plugins=[...]"
+        require(known, f"predictor.features must be {wanted}, not {self.features!r}")
+        enough = self.features != "counted" or self.frames > COUNTED_FRAMES
+        require(enough, f"predictor.features=counted needs more than {COUNTED_FRAMES} frames, got {self.frames}")
+        require(self.learning_rate > 0, "predictor.learning_rate must be positive")
+        for name in ("batch_size", "batches_per_update"):
+            require(getattr(self, name) >= 1, f"predictor.{name} must be at least 1, got {getattr(self, name)}")
+        require(min(self.hidden, default=1) >= 1, "predictor.hidden: a layer has at least 1 unit")
