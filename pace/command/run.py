@@ -33,7 +33,8 @@ def run_command(name: str, load: Callable[[], Work]) -> int:
 
     ``load`` imports and returns the work; it is called when the configuration is composed, for torch takes seconds to
     load. The work gets that configuration. Modules that the user names, in ``plugins`` or by an import path, are
-    imported first (:mod:`pace.config.plugins`). Wrong input gives one line and status 2, an expected error one line and 1.
+    imported first (:mod:`pace.config.plugins`). Wrong input gives one line and status 2, an expected error one line and
+    1.
     """
     try:
         if {"-h", "--help"} & set(sys.argv[1:]):
