@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from difflib import get_close_matches
 from typing import Any, Generic, TypeVar
 
@@ -143,6 +143,15 @@ def _as_struct(where: str, struct: Any, owner: Any, device: torch.device) -> Any
             raise LaunchError(f"{where} misses '{name}', which {struct.key} has")
         setattr(made, name, _as_argument(f"{where}.{name}", variable.type, known[name], device))
     return made
+
+
+def table(struct: Any, rows: Iterable[Any], device: torch.device) -> wp.array:
+    """An array of Warp structs, each from what has its fields as attributes or keys. Keep the tensors in them alive.
+
+    Errors: :class:`LaunchError` as those of :class:`Launch`.
+    """
+    made = [_as_struct("row", struct, row, device) for row in rows]
+    return wp.array(made, dtype=struct, device=wp.device_from_torch(device))
 
 
 def as_array(where: str, declared: Any, tensor: Tensor, device: torch.device) -> wp.array:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pace.arrays.launch import Launch
-from pace.arrays.state import Stateful
+from pace.arrays.state import Stateful, tensors_named
 from pace.arrays.tensors import allocate
 from pace.sim.robot import RIGHT_ARM
 from pace.task.game import Game
@@ -79,35 +79,15 @@ class TaskState(Derived, Stateful):
 
     def _record(self, worlds: Worlds) -> None:
         ball, game, count, device = self.ball, self.game, worlds.num_worlds, worlds.device
-        self._derive = Launch(
-            derive,
-            count,
-            device,
-            game=game,
-            derived=self,
-            position=ball.position,
-            velocity=ball.velocity,
-            robot=self.robot,
-            nominal=self.nominal,
-            rules=game.rules,
-        )
+        seen = {"game": game, "ball": ball, "robot": self.robot, "nominal": self.nominal, "rules": game.rules}
+        self._derive = Launch(derive, count, device, derived=self, **seen)
         groups = {
             group: torch.tensor([float(belongs(name)) for name in worlds.joint_names], device=device)
             for group, belongs in JOINT_GROUPS.items()
         }
-        self._measure = Launch(
-            measure,
-            count,
-            device,
-            robot=self.robot,
-            action=self.action,
-            previous_action=self.previous_action,
-            joints=groups | {"nominal": self.nominal},
-            foot_contact=self.foot_contact,
-            point=game.target.point,
-            base_error=self.base_error,
-            measures=self.measures,
-        )
+        measured = tensors_named(self, ("action", "previous_action", "foot_contact", "base_error"))
+        measured |= {"robot": self.robot, "point": game.target.point, "joints": groups | {"nominal": self.nominal}}
+        self._measure = Launch(measure, count, device, measures=self.measures, **measured)
 
     def refresh(self) -> None:
         """Compute all shared quantities from the robot's and the ball's new state."""
