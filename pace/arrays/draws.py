@@ -11,8 +11,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from pace.arrays.launch import MaskedLaunch
-from pace.arrays.share import share
+from pace.arrays.launch import MaskedLaunch, table
 
 
 @wp.struct
@@ -61,22 +60,13 @@ class Draws:
         self._columns, self._generator = columns, generator  # the kernel's table knows the tensors by address alone
         num_worlds, device = columns[0].values.shape[0], columns[0].values.device
         self._seed = torch.zeros(1, dtype=torch.int32, device=device)
-        table = wp.array(
-            [_arrays(column) for column in columns], dtype=ColumnArrays, device=wp.device_from_torch(device)
-        )
-        self._draw = MaskedLaunch(_draw, num_worlds, device, seed=self._seed, columns=table)
+        rows = table(ColumnArrays, columns, device)
+        self._draw = MaskedLaunch(_draw, num_worlds, device, seed=self._seed, columns=rows)
 
     def __call__(self, mask: Tensor) -> None:
         """Draw for the worlds of ``mask`` (N,) bool; the others keep what they have."""
         self._seed.random_(generator=self._generator)
         self._draw(mask)
-
-
-def _arrays(column: Column) -> ColumnArrays:
-    arrays = ColumnArrays()
-    arrays.values = share(column.values)
-    arrays.low, arrays.high, arrays.least, arrays.most = column[1:]
-    return arrays
 
 
 def columns_of(values: Tensor, ranges: Sequence[Sequence[float]]) -> list[Column]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from difflib import get_close_matches
+from numbers import Real
 from typing import Any, Generic, TypeVar
 
 import torch
@@ -125,13 +126,16 @@ def _as_argument(where: str, declared: Any, value: Any, device: torch.device) ->
         return value if isinstance(value, declared.instance_type) else _as_struct(where, declared, value, device)
     if wp.types.is_array(declared):
         if isinstance(value, Tensor):
-            return as_array(where, declared, value, device)
+            return _as_array(where, declared, value, device)
         if not isinstance(value, wp.array):
             raise LaunchError(f"{where} must be a tensor, not {value!r}")
         return value
-    if isinstance(value, Tensor):
-        raise LaunchError(f"{where} must be a number, not a tensor")
-    return declared(*value) if isinstance(value, (tuple, list)) else value
+    size = getattr(declared, "_shape_", ())
+    if isinstance(value, (tuple, list)) and size == (len(value),):
+        return declared(*value)
+    if isinstance(value, declared) or (size == () and isinstance(value, Real)):
+        return value
+    raise LaunchError(f"{where} must be {declared.__name__}, not {'a tensor' if isinstance(value, Tensor) else value}")
 
 
 def _as_struct(where: str, struct: Any, owner: Any, device: torch.device) -> Any:
@@ -145,7 +149,16 @@ def _as_struct(where: str, struct: Any, owner: Any, device: torch.device) -> Any
     return made
 
 
-def as_array(where: str, declared: Any, tensor: Tensor, device: torch.device) -> wp.array:
+def table(struct: Any, rows: Iterable[Any], device: torch.device) -> wp.array:
+    """An array of Warp structs, each from what has its fields as attributes or keys. Keep the tensors in them alive.
+
+    Errors: :class:`LaunchError` as those of :class:`Launch`.
+    """
+    made = [_as_struct("row", struct, row, device) for row in rows]
+    return wp.array(made, dtype=struct, device=wp.device_from_torch(device))
+
+
+def _as_array(where: str, declared: Any, tensor: Tensor, device: torch.device) -> wp.array:
     """The Warp array of the ``declared`` type on a tensor's memory.
 
     Errors: :class:`LaunchError` that says ``where``, for a tensor of another type, shape or device.
@@ -157,7 +170,7 @@ def as_array(where: str, declared: Any, tensor: Tensor, device: torch.device) ->
     if tensor.dtype != dtype or dims != declared.ndim or tensor.shape[dims:] != inner:
         wanted = ", ".join([*["*"] * declared.ndim, *map(str, inner)])
         raise LaunchError(f"{where} must be {dtype} of shape ({wanted}), not {tensor.dtype} {tuple(tensor.shape)}")
-    if wp.device_from_torch(tensor.device) != wp.device_from_torch(device):
+    if tensor.device.type != device.type or (device.index is not None and tensor.device.index != device.index):
         raise LaunchError(f"{where} must lie on {device}, not on {tensor.device}")
     if inner and tensor.stride(-1) != 1:
         raise LaunchError(f"{where} must hold the numbers of each vector side by side")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from functools import cache, partial
 from typing import Any
@@ -16,14 +16,6 @@ def share(tensor: Tensor) -> wp.array:
     """The Warp array on a tensor's memory; rows (N, 3) are vectors. Keep the tensor alive."""
     rows = tensor.dtype == torch.float32 and tensor.dim() == 2 and tensor.shape[1] == 3
     return wp.from_torch(tensor, dtype=wp.vec3 if rows else None)
-
-
-def share_all(arrays: type, tensors: Mapping[str, Tensor]) -> Any:
-    """A Warp struct whose arrays lie on the memory of the tensors of the same names."""
-    struct = arrays()
-    for name, variable in arrays.vars.items():  # type: ignore[attr-defined]
-        setattr(struct, name, wp.from_torch(tensors[name], dtype=variable.type.dtype))
-    return struct
 
 
 def require_shape(name: str, tensor: Tensor, shape: tuple[int, ...]) -> None:

@@ -7,6 +7,8 @@ states themselves, so that paddle path and state belong to the same instants wit
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
 
 import mujoco
 import numpy as np
@@ -16,9 +18,30 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pace.arrays.launch import Bound, Launch, MaskedLaunch
+from pace.arrays.tensors import Float, Vec3, allocate, struct_of
+from pace.sim.robot_spec import FEET
+from pace.sim.robot_state import Feet
 
 #: The tips, in the order of the chains (``RobotSpec.tips``).
 PADDLE, LEFT_FOOT, HEAD = wp.constant(0), wp.constant(1), wp.constant(3)
+
+
+@dataclass(eq=False)
+class Tips:
+    """Paddle, feet and head of N worlds, world frame."""
+
+    #: (N, S + 1, 12): centre (m), unit normal (the link's x axis), linear velocity of the centre (m/s), angular
+    #: velocity (rad/s) at the S + 1 instants of the control step
+    paddle_path: Annotated[Float, "instants", "columns"]
+    foot_position: Feet  # m, centre of the sole, at the end of the control step as all that follows
+    foot_velocity: Feet  # m/s
+    foot_up: Feet  # unit vector, the foot's z axis
+    head_position: Vec3  # m
+
+
+@struct_of(Tips)
+class TipArrays:
+    """:class:`Tips` as kernels see it."""
 
 
 @wp.struct
@@ -100,11 +123,7 @@ def _update(
     chains: Chains,
     qpos_path: wp.array3d[float],
     qvel_path: wp.array3d[float],
-    paddle_path: wp.array3d[float],
-    foot_position: wp.array3d[float],
-    foot_velocity: wp.array3d[float],
-    foot_up: wp.array3d[float],
-    head_position: wp.array2d[float],
+    tips: TipArrays,
 ):
     """One item of one masked world: the paddle at each instant of the path, then both feet and the head at its end."""
     world, item = wp.tid()
@@ -117,18 +136,18 @@ def _update(
     qvel = qvel_path[world, instant]
     tip = _tip(chains, chain, _base(qpos, qvel), qpos, qvel)
     if chain == PADDLE:
-        row = paddle_path[world, instant]
+        row = tips.paddle_path[world, instant]
         _store(row, 0, tip.position)
         _store(row, 3, wp.quat_rotate(tip.rotation, wp.vec3(1.0, 0.0, 0.0)))
         _store(row, 6, tip.velocity)
         _store(row, 9, tip.angular_velocity)
     elif chain == HEAD:
-        _store(head_position[world], 0, tip.position)
+        tips.head_position[world] = tip.position
     else:
         foot = chain - LEFT_FOOT
-        _store(foot_position[world, foot], 0, tip.position)
-        _store(foot_velocity[world, foot], 0, tip.velocity)
-        _store(foot_up[world, foot], 0, wp.quat_rotate(tip.rotation, wp.vec3(0.0, 0.0, 1.0)))
+        tips.foot_position[world, foot] = tip.position
+        tips.foot_velocity[world, foot] = tip.velocity
+        tips.foot_up[world, foot] = wp.quat_rotate(tip.rotation, wp.vec3(0.0, 0.0, 1.0))
 
 
 @wp.kernel
@@ -222,15 +241,10 @@ def _build_chains(model: mujoco.MjModel, tips: Sequence[str], device: wp.Device)
     return chains
 
 
-class Kinematics:
+class Kinematics(Tips):
     """Paddle path, feet and head of N worlds, from the state path of a :class:`~pace.sim.engine.base.RobotEngine`.
 
-    Attributes (float32, world frame; the same tensors for ever, overwritten by :meth:`update`):
-        paddle_path: (N, S + 1, 12): centre (m), unit normal (the link's x axis), linear velocity of the centre (m/s),
-            angular velocity (rad/s) at the S + 1 instants of the control step.
-        foot_position, foot_velocity, foot_up: (N, 2, 3): centre of the left and right sole (m), its velocity (m/s),
-            the foot's z axis, at the end of the control step.
-        head_position: (N, 3) m, at the end of the control step.
+    Its attributes are those of :class:`Tips`, allocated once and overwritten by :meth:`update`.
     """
 
     def __init__(
@@ -239,11 +253,7 @@ class Kinematics:
         self._device, self._num_tips = torch.device(device), len(tips)
         self._chains = _build_chains(model, tips, wp.device_from_torch(self._device))
         self._num_worlds = num_worlds
-        self.paddle_path = torch.zeros(num_worlds, substeps + 1, 12, device=device)
-        self.foot_position = torch.zeros(num_worlds, 2, 3, device=device)
-        self.foot_velocity = torch.zeros(num_worlds, 2, 3, device=device)
-        self.foot_up = torch.zeros(num_worlds, 2, 3, device=device)
-        self.head_position = torch.zeros(num_worlds, 3, device=device)
+        super().__init__(**vars(allocate(Tips, num_worlds, device, instants=substeps + 1, columns=12, feet=FEET)))
         self._sensed_centre = torch.zeros(num_worlds, 3, device=device)
         self._sensed_normal = torch.zeros(num_worlds, 3, device=device)
         self._path: tuple[Tensor, Tensor] | None = None
@@ -265,19 +275,8 @@ class Kinematics:
     def _record_update(self, qpos_path: Tensor, qvel_path: Tensor) -> MaskedLaunch:
         self._path = (qpos_path, qvel_path)
         worlds, instants, _ = self.paddle_path.shape
-        return MaskedLaunch(
-            _update,
-            (worlds, instants + self._num_tips - 1),
-            self._device,
-            chains=self._chains,
-            qpos_path=qpos_path,
-            qvel_path=qvel_path,
-            paddle_path=self.paddle_path,
-            foot_position=self.foot_position,
-            foot_velocity=self.foot_velocity,
-            foot_up=self.foot_up,
-            head_position=self.head_position,
-        )
+        given = {"chains": self._chains, "qpos_path": qpos_path, "qvel_path": qvel_path}
+        return MaskedLaunch(_update, (worlds, instants + self._num_tips - 1), self._device, tips=self, **given)
 
     def paddle_pose(
         self, base_position: Tensor, base_quat: Tensor, joint_position: Tensor, mask: Tensor | None = None
@@ -292,17 +291,9 @@ class Kinematics:
         return self._sensed_centre, self._sensed_normal
 
     def _record_pose(self, base_position: Tensor, base_quat: Tensor, joint_position: Tensor) -> MaskedLaunch:
-        return MaskedLaunch(
-            _paddle_pose,
-            self._num_worlds,
-            self._device,
-            chains=self._chains,
-            base_position=base_position,
-            base_quat=base_quat,
-            joint_position=joint_position,
-            centre=self._sensed_centre,
-            normal=self._sensed_normal,
-        )
+        pose = {"base_position": base_position, "base_quat": base_quat, "joint_position": joint_position}
+        found = {"centre": self._sensed_centre, "normal": self._sensed_normal}
+        return MaskedLaunch(_paddle_pose, self._num_worlds, self._device, chains=self._chains, **pose, **found)
 
     def paddle_generalized_force(self, force: Tensor, point: Tensor, out: Tensor) -> None:
         """Write J^T f of a force on the paddle's link into ``out`` (N, 6 + J), for the end of the path last given.
@@ -316,14 +307,6 @@ class Kinematics:
         self._push(*self._path, force, point, out)()
 
     def _record_push(self, qpos_path: Tensor, qvel_path: Tensor, force: Tensor, point: Tensor, out: Tensor) -> Launch:
-        return Launch(
-            _paddle_jacobian_transpose,
-            self._num_worlds,
-            self._device,
-            chains=self._chains,
-            qpos_path=qpos_path,
-            qvel_path=qvel_path,
-            force=force,
-            point=point,
-            out=out,
-        )
+        state = {"chains": self._chains, "qpos_path": qpos_path, "qvel_path": qvel_path}
+        push = {"force": force, "point": point, "out": out}
+        return Launch(_paddle_jacobian_transpose, self._num_worlds, self._device, **state, **push)

@@ -87,17 +87,9 @@ class Randomizer(Stateful):
         self._until_push = torch.zeros(num_worlds, device=device)
         self._draw = Draws(self._columns(), generator)
         self._seed = torch.zeros(1, dtype=torch.int32, device=device)
-        self._advance_push = Launch(
-            _push,
-            num_worlds,
-            device,
-            seed=self._seed,
-            control_dt=control_dt,
-            interval=config.push_interval,
-            velocity=config.push_velocity,
-            until_push=self._until_push,
-            push=self.push,
-        )
+        drawn = {"interval": config.push_interval, "velocity": config.push_velocity, "seed": self._seed}
+        kept = {"until_push": self._until_push, "push": self.push}
+        self._advance_push = Launch(_push, num_worlds, device, control_dt=control_dt, **drawn, **kept)
         self.draw(torch.ones(num_worlds, dtype=torch.bool, device=device))
 
     def _columns(self) -> list[Column]:

@@ -16,6 +16,7 @@ from pace.arrays.tensors import named_tensors
 from pace.config.sim import SimConfig
 from pace.devices import resolve_device
 from pace.sim.ball.ball import BallParams, BallSim
+from pace.sim.ball.state import BallArrays, BallState
 from pace.sim.engine.factory import make_engine
 from pace.sim.kinematics import Kinematics
 from pace.sim.randomization import Randomizer
@@ -81,23 +82,13 @@ def _stand(
 
 
 @wp.kernel
-def _launch_ball(
-    mask: wp.array[wp.bool],
-    position: wp.array2d[float],
-    velocity: wp.array2d[float],
-    spin: wp.array2d[float],
-    own_position: wp.array2d[float],
-    own_velocity: wp.array2d[float],
-    own_spin: wp.array2d[float],
-):
+def _launch_ball(mask: wp.array[wp.bool], start: BallArrays, ball: BallArrays):
     """Start a masked world's ball in a given state."""
     world = wp.tid()
-    if not mask[world]:
-        return
-    for i in range(3):
-        own_position[world, i] = position[world, i]
-        own_velocity[world, i] = velocity[world, i]
-        own_spin[world, i] = spin[world, i]
+    if mask[world]:
+        ball.position[world] = start.position[world]
+        ball.velocity[world] = start.velocity[world]
+        ball.spin[world] = start.spin[world]
 
 
 class Worlds(Stateful):
@@ -169,37 +160,19 @@ class Worlds(Stateful):
 
     def _record(self) -> None:
         n, device, qpos = self.num_worlds, self.device, self.engine.qpos_path
-        self._derive = MaskedLaunch(
-            _derive,
-            n,
-            device,
-            qpos=qpos,
-            qvel=self.engine.qvel_path,
-            last=self.config.substeps,
-            inverse_dt=1.0 / self.control_dt,
-            gravity=self._gravity,
-            heading=self._heading,
-            acceleration=self._acceleration,
-        )
-        impulse = self.ball.events.paddle_impulse
-        self._stand = MaskedLaunch(
-            _stand, n, device, qpos=qpos, previous_targets=self._previous_targets, impulse=impulse
-        )
-        self._update_delay = Launch(
-            _spread_delay,
-            n,
-            device,
-            delay=self.randomizer.actuator_delay,
-            physics_dt=self.config.engine.physics_dt,
-            new_share=self._new_share.squeeze(-1),
-        )
+        path = {"qpos": qpos, "qvel": self.engine.qvel_path, "last": self.config.substeps}
+        derived = {"gravity": self._gravity, "heading": self._heading, "acceleration": self._acceleration}
+        self._derive = MaskedLaunch(_derive, n, device, inverse_dt=1.0 / self.control_dt, **path, **derived)
+        held = {"previous_targets": self._previous_targets, "impulse": self.ball.events.paddle_impulse}
+        self._stand = MaskedLaunch(_stand, n, device, qpos=qpos, **held)
+        delay, share = self.randomizer.actuator_delay, self._new_share.squeeze(-1)
+        times = {"delay": delay, "physics_dt": self.config.engine.physics_dt}
+        self._update_delay = Launch(_spread_delay, n, device, new_share=share, **times)
         self._serve = Bound(self._record_serve, position=(n, 3), velocity=(n, 3), spin=(n, 3))
 
     def _record_serve(self, position: Tensor, velocity: Tensor, spin: Tensor) -> MaskedLaunch:
-        ball = self.ball
-        own = {"own_position": ball.position, "own_velocity": ball.velocity, "own_spin": ball.spin}
-        given = {"position": position, "velocity": velocity, "spin": spin}
-        return MaskedLaunch(_launch_ball, self.num_worlds, self.device, **given, **own)
+        start = BallState(position, velocity, spin)
+        return MaskedLaunch(_launch_ball, self.num_worlds, self.device, start=start, ball=self.ball)
 
     def _robot_state(self) -> RobotState:
         qpos, qvel = self.engine.qpos_path[:, -1], self.engine.qvel_path[:, -1]

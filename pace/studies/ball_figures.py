@@ -110,9 +110,9 @@ def draw_rebound(figure: Figure) -> None:
     slip = np.linspace(0.05, 8.0, 60)
     kept, turned = figure.subplots(1, 2)
     for friction, colour in zip((0.1, 0.25, 0.38, 0.6), COLOURS, strict=True):
-        velocity, spin = (wp.zeros(len(slip), dtype=wp.vec3, device="cpu") for _ in range(2))
-        given = [wp.array(slip, dtype=wp.float32, device="cpu"), friction, velocity, spin]
-        wp.launch(_strike, dim=len(slip), inputs=given, device="cpu")
+        velocity, spin = torch.zeros(2, len(slip), 3)
+        given = {"slip": torch.tensor(slip, dtype=torch.float32), "friction": friction}
+        Launch(_strike, len(slip), torch.device("cpu"), velocity=velocity, spin=spin, **given)()
         loss = np.minimum(0.4 * slip, friction * 1.8)
         kept.plot(slip, 1 - loss / slip, color=colour, lw=1.5, label=f"μ = {friction}")
         kept.plot(slip[::4], velocity.numpy()[::4, 0] / slip[::4], "o", color=colour, ms=4)

@@ -16,6 +16,7 @@ from pace.arrays.graph import CapturedCall, graphs_wanted
 from pace.arrays.state import Stateful, tensors_named, under_prefix, with_prefix
 from pace.config.base import ConfigError
 from pace.config.task import TaskConfig
+from pace.sim.ball.state import BallState
 from pace.sim.sensing import Sensing
 from pace.sim.worlds import Worlds
 from pace.task.game import Game
@@ -131,9 +132,9 @@ class TableTennisEnv(EnvBase):
         )
         self.task_state = TaskState(worlds, self.game, self.sensing.delay)
         ball, events = worlds.ball, worlds.ball.events
-        struck = (events.hit_position, events.hit_velocity_out, events.hit_spin_out)
-        self._forecast_return = ball.forecaster(*struck, reward.target_x)
-        self._forecast_serve = ball.forecaster(ball.position, ball.velocity, ball.spin, reward.target_x)
+        struck = BallState(events.hit_position, events.hit_velocity_out, events.hit_spin_out)
+        self._forecast_return = ball.forecaster(struck, reward.target_x)
+        self._forecast_serve = ball.forecaster(ball, reward.target_x)
         self.rewards = RewardManager(reward, self.num_worlds, device, worlds.control_dt)
         signals = (self.sensing, worlds.kinematics, worlds.nominal, self.task_state.action)
         self.actor = ActorSignals(*signals, predictor, config.predictor, self.game.rules, config.observation)

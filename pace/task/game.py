@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from pace.arrays.launch import Launch, MaskedLaunch
-from pace.arrays.state import Stateful, tensors_named
+from pace.arrays.state import Stateful
 from pace.arrays.tensors import allocate, named_tensors
 from pace.config.task import RewardConfig, ServeConfig, TaskConfig
 from pace.task import game_kernels
@@ -71,28 +71,16 @@ class Game(GameState, Stateful):
         self._record(config.serve, ball, base_position)
 
     def _record(self, config: ServeConfig, ball: BallSim, base_position: Tensor) -> None:
-        count, device, position, velocity = ball.num_worlds, ball.device, ball.position, ball.velocity
-        given = {"game": self, "position": position, "velocity": velocity, "rules": self.rules}
-        self._judge = Launch(game_kernels.judge, count, device, game=self, events=ball.events, position=position)
-        self._close = Launch(
-            game_kernels.close,
-            count,
-            device,
-            events=ball.events,
-            forecast=ball.forecast_result,
-            paddle_distance=ball.nearest_paddle_distance,
-            radius=ball.params.radius,
-            base_position=base_position,
-            **given,
-        )
-        self._start_serve = MaskedLaunch(
-            game_kernels.start_serve, count, device, forecast=ball.forecast_result, **given
-        )
+        count, device, forecast = ball.num_worlds, ball.device, ball.forecast_result
+        given = {"game": self, "ball": ball, "forecast": forecast, "rules": self.rules}
+        self._judge = Launch(game_kernels.judge, count, device, game=self, events=ball.events, ball=ball)
+        seen = {"events": ball.events, "paddle_distance": ball.nearest_paddle_distance}
+        seen |= {"radius": ball.params.radius, "base_position": base_position}
+        self._close = Launch(game_kernels.close, count, device, **given, **seen)
+        self._start_serve = MaskedLaunch(game_kernels.start_serve, count, device, **given)
         serves = config.serves_per_episode if config.random_phase else 0
-        clock = tensors_named(self.clock, ("fresh", "index"))
-        self._start_episode = MaskedLaunch(
-            game_kernels.start_episode, count, device, seed=self._seed, serves=serves, **clock
-        )
+        drawn = {"seed": self._seed, "serves": serves, "fresh": self.clock.fresh, "index": self.clock.index}
+        self._start_episode = MaskedLaunch(game_kernels.start_episode, count, device, **drawn)
 
     def judge(self) -> None:
         """The referee consumes the events of the control step."""

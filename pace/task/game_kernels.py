@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from pace.sim.ball.events import EventArrays, ForecastArrays
+from pace.sim.ball.state import BallArrays, EventArrays, ForecastArrays
 from pace.task.game_state import GameArrays
 from pace.task.outcome import Outcome
 
@@ -57,9 +57,9 @@ def clamp_x(point: wp.vec3, largest: float) -> wp.vec3:
 
 
 @wp.func
-def something_to_hit_now(game: GameArrays, position: wp.vec3, velocity: wp.vec3, rules: Rules, world: int) -> bool:
+def something_to_hit_now(game: GameArrays, ball: BallArrays, rules: Rules, world: int) -> bool:
     undecided = game.referee.outcome[world] == OPEN and not game.referee.touched[world]
-    return undecided and not nothing_to_hit(position, velocity, rules)
+    return undecided and not nothing_to_hit(ball.position[world], ball.velocity[world], rules)
 
 
 @wp.func
@@ -106,7 +106,7 @@ def _judge_flight(
 
 
 @wp.kernel
-def judge(game: GameArrays, events: EventArrays, position: wp.array[wp.vec3]):
+def judge(game: GameArrays, events: EventArrays, ball: BallArrays):
     """The referee: consume the events of one control step in the order of their times."""
     world = wp.tid()
     was_open = game.referee.outcome[world] == OPEN
@@ -137,7 +137,7 @@ def judge(game: GameArrays, events: EventArrays, position: wp.array[wp.vec3]):
             touches -= 1
             if bounce_first:
                 own_count -= 1
-        outcome = _judge_flight(game, events, world, since, own_count, touches, dead, position[world][0])
+        outcome = _judge_flight(game, events, world, since, own_count, touches, dead, ball.position[world][0])
     if hit_now:
         game.referee.hit[world] = True
         game.referee.rim[world] = events.hit_rim[world]
@@ -200,8 +200,7 @@ def close(
     game: GameArrays,
     events: EventArrays,
     forecast: ForecastArrays,
-    position: wp.array[wp.vec3],
-    velocity: wp.array[wp.vec3],
+    ball: BallArrays,
     paddle_distance: wp.array[wp.float32],
     radius: wp.array[wp.float32],
     base_position: wp.array[wp.vec3],
@@ -214,7 +213,7 @@ def close(
         _take_return(game, forecast, world)
     _approach(game, world, paddle_distance[world] - radius[world])
     lost = _lost(base_position[world], rules)
-    over = _over(game, rules, world, position[world][2], events.floor[world] > 0)
+    over = _over(game, rules, world, ball.position[world][2], events.floor[world] > 0)
     outcome = game.referee.outcome[world]
     if outcome == OPEN:
         if lost:
@@ -238,7 +237,7 @@ def close(
     game.ends.truncated[world] = over and last and not lost
     game.ends.outcome[world] = outcome
     game.ends.hit[world] = game.referee.hit[world]
-    game.target.something_to_hit[world] = something_to_hit_now(game, position[world], velocity[world], rules, world)
+    game.target.something_to_hit[world] = something_to_hit_now(game, ball, rules, world)
 
 
 @wp.func
@@ -268,8 +267,7 @@ def start_serve(
     mask: wp.array[wp.bool],
     game: GameArrays,
     forecast: ForecastArrays,
-    position: wp.array[wp.vec3],
-    velocity: wp.array[wp.vec3],
+    ball: BallArrays,
     rules: Rules,
 ):
     """Begin the serve whose flight was forecast, in the masked worlds."""
@@ -294,7 +292,7 @@ def start_serve(
     game.closeness.nearest[world] = wp.inf
     game.closeness.previous[world] = wp.inf
     game.closeness.arrived[world] = False
-    game.target.something_to_hit[world] = something_to_hit_now(game, position[world], velocity[world], rules, world)
+    game.target.something_to_hit[world] = something_to_hit_now(game, ball, rules, world)
 
 
 @wp.kernel

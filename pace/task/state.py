@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from pace.arrays.launch import Launch
-from pace.arrays.state import Stateful
+from pace.arrays.state import Stateful, tensors_named
 from pace.arrays.tensors import allocate
 from pace.task.game import Game
 from pace.task.measures import Derived, Measures
@@ -67,36 +67,16 @@ class TaskState(Derived, Stateful):
 
     def _record(self, worlds: Worlds) -> None:
         ball, game, count, device = self.ball, self.game, worlds.num_worlds, worlds.device
-        self._derive = Launch(
-            derive,
-            count,
-            device,
-            game=game,
-            derived=self,
-            position=ball.position,
-            velocity=ball.velocity,
-            robot=self.robot,
-            nominal=self.nominal,
-            rules=game.rules,
-        )
+        seen = {"game": game, "ball": ball, "robot": self.robot, "nominal": self.nominal, "rules": game.rules}
+        self._derive = Launch(derive, count, device, derived=self, **seen)
         joints, members = worlds.spec.joints, worlds.spec.groups
         groups = {
             group: torch.tensor([float(name in members.get(group, ())) for name in joints], device=device)
             for group in JOINT_GROUPS
         }
-        self._measure = Launch(
-            measure,
-            count,
-            device,
-            robot=self.robot,
-            action=self.action,
-            previous_action=self.previous_action,
-            joints=groups | {"nominal": self.nominal},
-            foot_contact=self.foot_contact,
-            point=game.target.point,
-            base_error=self.base_error,
-            measures=self.measures,
-        )
+        measured = tensors_named(self, ("action", "previous_action", "foot_contact", "base_error"))
+        measured |= {"robot": self.robot, "point": game.target.point, "joints": groups | {"nominal": self.nominal}}
+        self._measure = Launch(measure, count, device, measures=self.measures, **measured)
 
     def refresh(self) -> None:
         """Compute all shared quantities from the robot's and the ball's new state."""

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from pace.sim.ball.state import BallArrays
 from pace.sim.robot_state import RobotArrays
 from pace.task.game_kernels import LONGEST_TIME, Rules, something_to_hit_now
 from pace.task.game_state import GameArrays
@@ -122,15 +123,14 @@ def measure(
 def derive(
     game: GameArrays,
     derived: DerivedArrays,
-    position: wp.array[wp.vec3],
-    velocity: wp.array[wp.vec3],
+    ball: BallArrays,
     robot: RobotArrays,
     nominal: wp.array[wp.float32],
     rules: Rules,
 ):
     """Shared quantities of one world from its present state."""
     world = wp.tid()
-    something = something_to_hit_now(game, position[world], velocity[world], rules, world)
+    something = something_to_hit_now(game, ball, rules, world)
     game.target.something_to_hit[world] = something
     apex = rules.idle_point
     target = rules.idle_point

@@ -10,7 +10,7 @@ import warp as wp
 from torch import Tensor
 
 from pace.arrays.graph import CapturedCall
-from pace.arrays.share import record
+from pace.arrays.launch import Launch
 from pace.config.base import ConfigError
 from pace.predictor.network import PredictorNetwork
 from pace.task.env import TableTennisEnv
@@ -149,7 +149,7 @@ def test_a_cuda_graph_holds_torchs_and_warps_work() -> None:
     device = torch.device("cuda:0")
     generator, same = (torch.Generator(device).manual_seed(3) for _ in range(2))
     drawn, total = torch.zeros(8, device=device), torch.zeros(8, device=device)
-    add = record(_add, 8, [wp.from_torch(drawn), wp.from_torch(total)], device)
+    add = Launch(_add, 8, device, total=total, values=drawn)
 
     def function(scale: Tensor) -> None:
         drawn.copy_(scale * torch.rand(8, device=device, generator=generator))

@@ -51,8 +51,8 @@ def fake_ball(n: int) -> Any:
     set_serve(forecast)
     return SimpleNamespace(
         num_worlds=n, device=CPU, position=torch.tensor([0.5, 0.0, 1.1]).repeat(n, 1),
-        velocity=torch.tensor([-5.0, 0.1, 0.5]).repeat(n, 1), events=allocate(BallEvents, n, CPU),
-        forecast_result=forecast, nearest_paddle_distance=torch.ones(n),
+        velocity=torch.tensor([-5.0, 0.1, 0.5]).repeat(n, 1), spin=torch.zeros(n, 3),
+        events=allocate(BallEvents, n, CPU), forecast_result=forecast, nearest_paddle_distance=torch.ones(n),
         params=SimpleNamespace(radius=torch.full((n,), 0.02)),
     )  # fmt: skip
 

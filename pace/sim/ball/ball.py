@@ -17,10 +17,10 @@ from pace.arrays.launch import Bound, Launch, MaskedLaunch
 from pace.arrays.tensors import allocate
 from pace.config.base import ConfigError, config_dir, parse
 from pace.config.sim import BallConfig, TableConfig
-from pace.sim.ball.events import BallEvents, Forecast
 from pace.sim.ball.flight import Scene
 from pace.sim.ball.kernels import FORECAST_HORIZON, fly_step, forecast_flight, skip_flight
 from pace.sim.ball.rebound import Material
+from pace.sim.ball.state import BallEvents, BallState, Forecast
 
 __all__ = ["FORECAST_HORIZON", "BallEvents", "BallParams", "BallSim", "Forecast", "ball_preset"]
 
@@ -126,7 +126,7 @@ def _scene(table: TableConfig, path_dt: float) -> Scene:
     return scene
 
 
-class BallSim:
+class BallSim(BallState):
     """The ball of N worlds. ``fly`` moves it through one control step, ``forecast`` looks ahead.
 
     All tensors are float32 on ``device``, share memory with Warp and are the same objects for ever: edit them in place.
@@ -163,9 +163,7 @@ class BallSim:
         self.num_worlds = num_worlds
         self.device = torch.device(device)
         self.control_dt = control_dt
-        self.position = torch.zeros(num_worlds, 3, device=device)
-        self.velocity = torch.zeros(num_worlds, 3, device=device)
-        self.spin = torch.zeros(num_worlds, 3, device=device)
+        super().__init__(**vars(allocate(BallState, num_worlds, device)))
         self.nearest_paddle_distance = torch.zeros(num_worlds, device=device)
         matrix = params.matrix(num_worlds, device)
         self.params = BallParams(*matrix.unbind(1))
@@ -173,9 +171,8 @@ class BallSim:
         self.forecast_result = allocate(Forecast, num_worlds, device)
         self._path_shape = (num_worlds, substeps + 1, PATH_WIDTH)
         self._scene = _scene(table, control_dt / substeps)
-        self._ball = {"position": self.position, "velocity": self.velocity, "spin": self.spin}
         self._flown = {"params": matrix, "scene": self._scene, "ball_dt": ball_dt}  # what every flight needs to know
-        self._ask = {name: torch.zeros_like(tensor) for name, tensor in self._ball.items()}
+        self._ask = allocate(BallState, num_worlds, device)
         self._ahead: dict[float, MaskedLaunch] = {}  # by intercept_x, from _ask
         self._fly = Bound(self._record_flight, paddle_path=None)
 
@@ -186,16 +183,8 @@ class BallSim:
                 f"not {path.dtype} of shape {tuple(path.shape)}"
             )
         self._scene.path = wp.from_torch(path)
-        return Launch(
-            fly_step,
-            self.num_worlds,
-            self.device,
-            events=self.events,
-            nearest=self.nearest_paddle_distance,
-            control_dt=self.control_dt,
-            **self._ball,
-            **self._flown,
-        )
+        given = {"nearest": self.nearest_paddle_distance, "control_dt": self.control_dt} | self._flown
+        return Launch(fly_step, self.num_worlds, self.device, ball=self, events=self.events, **given)
 
     def fly(self, paddle_path: Tensor) -> None:
         """Fly one control step along ``paddle_path`` (N, S + 1, 12), world frame, S + 1 equidistant instants:
@@ -215,29 +204,20 @@ class BallSim:
         Fills their rows of ``forecast_result`` and leaves the others; ``intercept_x`` is in m. The flight passes
         through paddles; net, table and floor are met.
         """
-        for own, given in zip(self._ask.values(), (position, velocity, spin), strict=True):
+        for own, given in zip(vars(self._ask).values(), (position, velocity, spin), strict=True):
             own.copy_(given)
         if intercept_x not in self._ahead:
-            self._ahead[intercept_x] = self.forecaster(**self._ask, intercept_x=intercept_x)
+            self._ahead[intercept_x] = self.forecaster(self._ask, intercept_x)
         self._ahead[intercept_x](mask)
 
-    def forecaster(self, position: Tensor, velocity: Tensor, spin: Tensor, intercept_x: float) -> MaskedLaunch:
+    def forecaster(self, ball: BallState, intercept_x: float) -> MaskedLaunch:
         """:meth:`forecast` of a mask, always from these tensors: it reads them where they lie, which saves copies."""
-        return MaskedLaunch(
-            forecast_flight,
-            self.num_worlds,
-            self.device,
-            position=position,
-            velocity=velocity,
-            spin=spin,
-            forecast=self.forecast_result,
-            intercept_x=intercept_x,
-            **self._flown,
-        )
+        given = {"forecast": self.forecast_result, "intercept_x": intercept_x} | self._flown
+        return MaskedLaunch(forecast_flight, self.num_worlds, self.device, ball=ball, **given)
 
     def skipper(self, duration: Tensor) -> MaskedLaunch:
         """A function of a mask (N,) bool that moves those balls on by ``duration`` (N,) s of their flight at once.
 
         No further than to where they are about to touch something; nothing is hit and nothing is noted.
         """
-        return MaskedLaunch(skip_flight, self.num_worlds, self.device, duration=duration, **self._ball, **self._flown)
+        return MaskedLaunch(skip_flight, self.num_worlds, self.device, ball=self, duration=duration, **self._flown)

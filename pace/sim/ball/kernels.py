@@ -5,7 +5,6 @@ One thread a world.
 
 import warp as wp
 
-from pace.sim.ball.events import EventArrays, ForecastArrays
 from pace.sim.ball.flight import (
     FLOOR,
     NET,
@@ -28,6 +27,7 @@ from pace.sim.ball.flight import (
     reachable_surfaces,
     read_body,
 )
+from pace.sim.ball.state import BallArrays, EventArrays, ForecastArrays
 
 #: s, the forecast looks no further ahead; a ball that rolls on the table would go on for ever.
 FORECAST_HORIZON = 3.0
@@ -151,12 +151,12 @@ def _record_event(events: EventArrays, leg: Leg, after: Flight, body: Body, scen
 
 
 @wp.func
-def _flight_of(position: wp.array[wp.vec3], velocity: wp.array[wp.vec3], spin: wp.array[wp.vec3], world: int) -> Flight:
+def _flight_of(ball: BallArrays, world: int) -> Flight:
     """The flight that begins with the ball of a world; its gaps are still to be found."""
     flight = Flight()
-    flight.position = position[world]
-    flight.velocity = velocity[world]
-    flight.spin = spin[world]
+    flight.position = ball.position[world]
+    flight.velocity = ball.velocity[world]
+    flight.spin = ball.spin[world]
     return flight
 
 
@@ -170,9 +170,7 @@ def _segment_distance(start: wp.vec3, end: wp.vec3) -> float:
 
 @wp.kernel
 def fly_step(
-    position: wp.array[wp.vec3],
-    velocity: wp.array[wp.vec3],
-    spin: wp.array[wp.vec3],
+    ball: BallArrays,
     params: wp.array2d[wp.float32],
     scene: Scene,
     events: EventArrays,
@@ -184,7 +182,7 @@ def fly_step(
     world = wp.tid()
     _clear_events(events, world)
     body = read_body(params, world)
-    flight = _flight_of(position, velocity, spin, world)
+    flight = _flight_of(ball, world)
     paddle_speed = paddle_speed_bound(scene, world)
     # A rebound turns spin into speed.
     speed = wp.length(flight.velocity) + body.radius * wp.length(flight.spin)
@@ -202,9 +200,9 @@ def fly_step(
             _record_event(events, leg, flight, body, scene, world)
         if flight.clock >= control_dt * 0.999999:
             break
-    position[world] = flight.position
-    velocity[world] = flight.velocity
-    spin[world] = flight.spin
+    ball.position[world] = flight.position
+    ball.velocity[world] = flight.velocity
+    ball.spin[world] = flight.spin
     nearest[world] = distance
 
 
@@ -287,9 +285,7 @@ def _note_contact(forecast: ForecastArrays, leg: Leg, after: Flight, world: int)
 @wp.kernel
 def forecast_flight(
     mask: wp.array[wp.bool],
-    position: wp.array[wp.vec3],
-    velocity: wp.array[wp.vec3],
-    spin: wp.array[wp.vec3],
+    ball: BallArrays,
     params: wp.array2d[wp.float32],
     scene: Scene,
     forecast: ForecastArrays,
@@ -302,7 +298,7 @@ def forecast_flight(
         return
     _clear_forecast(forecast, world)
     body = read_body(params, world)
-    flight = _flight_of(position, velocity, spin, world)
+    flight = _flight_of(ball, world)
     flight.gaps = gaps_to(STATIC_SURFACES, flight.position, 0.0, body.radius, scene, world)
     for _leg in range(_MAX_FORECAST_LEGS):
         remaining = _HORIZON - flight.clock
@@ -322,9 +318,7 @@ def forecast_flight(
 def skip_flight(
     mask: wp.array[wp.bool],
     duration: wp.array[wp.float32],
-    position: wp.array[wp.vec3],
-    velocity: wp.array[wp.vec3],
-    spin: wp.array[wp.vec3],
+    ball: BallArrays,
     params: wp.array2d[wp.float32],
     scene: Scene,
     ball_dt: float,
@@ -334,7 +328,7 @@ def skip_flight(
     if not mask[world]:
         return
     body = read_body(params, world)
-    flight = _flight_of(position, velocity, spin, world)
+    flight = _flight_of(ball, world)
     flight.gaps = gaps_to(STATIC_SURFACES, flight.position, 0.0, body.radius, scene, world)
     for _leg in range(_MAX_FORECAST_LEGS):
         remaining = duration[world] - flight.clock
@@ -343,5 +337,5 @@ def skip_flight(
         flight, leg = fly_leg(flight, STATIC_SURFACES, 0.0, remaining, ball_dt, body, scene, world)
         if leg.surface != NOTHING:
             return
-        position[world] = flight.position
-        velocity[world] = flight.velocity
+        ball.position[world] = flight.position
+        ball.velocity[world] = flight.velocity

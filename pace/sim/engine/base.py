@@ -12,8 +12,8 @@ import warp as wp
 from torch import Tensor
 
 from pace.arrays.launch import Bound, MaskedLaunch
-from pace.arrays.state import Stateful, tensors_named
-from pace.arrays.tensors import Float, Start, Vec3, allocate
+from pace.arrays.state import Stateful
+from pace.arrays.tensors import Float, Start, Vec3, allocate, named_tensors, struct_of
 from pace.config.base import ConfigError
 from pace.sim.robot_spec import FEET
 
@@ -107,11 +107,23 @@ class RobotEngine(Protocol):
         ...
 
 
-#: What every engine shows; attributes of :class:`StateTensors`.
-OUTPUTS = ("qpos_path", "qvel_path", "foot_force", "body_contact", "joint_torque")
+@dataclass(eq=False)
+class EngineState:
+    """What every engine shows: see :class:`RobotEngine`."""
+
+    qpos_path: Annotated[Float, "instants", "nq"]
+    qvel_path: Annotated[Float, "instants", "nv"]
+    foot_force: Annotated[Vec3, "feet"]
+    body_contact: Annotated[Float, "bodies"]
+    joint_torque: Annotated[Float, "joints"]
 
 
-class StateTensors(Stateful):
+@struct_of(EngineState)
+class EngineArrays:
+    """:class:`EngineState` as kernels see it."""
+
+
+class StateTensors(EngineState, Stateful):
     """The tensors that every engine shows, and their part in reset and resume."""
 
     def __init__(
@@ -123,11 +135,9 @@ class StateTensors(Stateful):
             raise ConfigError(f"substeps must be at least 1, got {substeps}")
         self.num_worlds, self.device, self.substeps, self.physics_dt = num_worlds, device, substeps, physics_dt
         self.params = EngineParams.nominal(model, num_worlds, device)
-        self.qpos_path = torch.zeros(num_worlds, substeps + 1, model.nq, device=device)
-        self.qvel_path = torch.zeros(num_worlds, substeps + 1, model.nv, device=device)
-        self.foot_force = torch.zeros(num_worlds, FEET, 3, device=device)
-        self.body_contact = torch.zeros(num_worlds, model.nsensordata - 3 * FEET, device=device)
-        self.joint_torque = torch.zeros(num_worlds, model.nu, device=device)
+        sizes = {"feet": FEET, "bodies": model.nsensordata - 3 * FEET, "joints": model.nu}
+        sizes |= {"instants": substeps + 1, "nq": model.nq, "nv": model.nv}
+        super().__init__(**vars(allocate(EngineState, num_worlds, device, **sizes)))
         self.qpos_path.copy_(torch.as_tensor(model.key_qpos[0], dtype=torch.float32))
         starts = {"qpos": (num_worlds, model.nq), "qvel": (num_worlds, model.nv)}
         self._reset = Bound(self._record_reset, **starts)
@@ -141,21 +151,11 @@ class StateTensors(Stateful):
         self._reset(qpos, qvel)(mask)
 
     def _record_reset(self, qpos: Tensor, qvel: Tensor) -> MaskedLaunch:
-        solver = self._solver_state()
-        return MaskedLaunch(
-            reset_state,
-            self.num_worlds,
-            self.device,
-            qpos=qpos,
-            qvel=qvel,
-            own_qpos=solver["qpos"],
-            own_qvel=solver["qvel"],
-            warmstart=solver["warmstart"],
-            **tensors_named(self, OUTPUTS),
-        )
+        own = {f"own_{name}": tensor for name, tensor in self._solver_state().items()}
+        return MaskedLaunch(reset_state, self.num_worlds, self.device, qpos=qpos, qvel=qvel, state=self, **own)
 
     def state_tensors(self) -> dict[str, Tensor]:
-        return self._solver_state() | tensors_named(self, OUTPUTS)
+        return self._solver_state() | named_tensors(self)
 
     def _read_sensors(self, sensordata: Tensor, actuator_force: Tensor) -> None:
         """Sensors of the scene: a force of 3 for each foot, then a number of contacts for each other body."""
@@ -173,12 +173,8 @@ def reset_state(
     qvel: wp.array2d[wp.float32],
     own_qpos: wp.array2d[Any],
     own_qvel: wp.array2d[Any],
-    warmstart: wp.array2d[Any],
-    qpos_path: wp.array3d[wp.float32],
-    qvel_path: wp.array3d[wp.float32],
-    foot_force: wp.array3d[wp.float32],
-    body_contact: wp.array2d[wp.float32],
-    joint_torque: wp.array2d[wp.float32],
+    own_warmstart: wp.array2d[Any],
+    state: EngineArrays,
 ):
     """Put a masked world into the state qpos, qvel: at rest in it through the whole path, touching nothing."""
     world = wp.tid()
@@ -186,17 +182,16 @@ def reset_state(
         return
     for i in range(qpos.shape[1]):
         own_qpos[world, i] = own_qpos.dtype(qpos[world, i])
-        for instant in range(qpos_path.shape[1]):
-            qpos_path[world, instant, i] = qpos[world, i]
+        for instant in range(state.qpos_path.shape[1]):
+            state.qpos_path[world, instant, i] = qpos[world, i]
     for i in range(qvel.shape[1]):
         own_qvel[world, i] = own_qvel.dtype(qvel[world, i])
-        warmstart[world, i] = warmstart.dtype(0.0)
-        for instant in range(qvel_path.shape[1]):
-            qvel_path[world, instant, i] = qvel[world, i]
-    for foot in range(foot_force.shape[1]):
-        for i in range(foot_force.shape[2]):
-            foot_force[world, foot, i] = 0.0
-    for i in range(body_contact.shape[1]):
-        body_contact[world, i] = 0.0
-    for i in range(joint_torque.shape[1]):
-        joint_torque[world, i] = 0.0
+        own_warmstart[world, i] = own_warmstart.dtype(0.0)
+        for instant in range(state.qvel_path.shape[1]):
+            state.qvel_path[world, instant, i] = qvel[world, i]
+    for foot in range(state.foot_force.shape[1]):
+        state.foot_force[world, foot] = wp.vec3()
+    for i in range(state.body_contact.shape[1]):
+        state.body_contact[world, i] = 0.0
+    for i in range(state.joint_torque.shape[1]):
+        state.joint_torque[world, i] = 0.0

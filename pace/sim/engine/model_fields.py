@@ -1,16 +1,16 @@
 """Which model fields follow the parameters of each world, and the kernel that writes them, the same on both engines."""
 
 from collections.abc import Iterator, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
+import torch
 import warp as wp
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from pace.arrays.launch import MaskedLaunch
-from pace.arrays.share import share
+from pace.arrays.launch import MaskedLaunch, table
 from pace.sim.engine.base import EngineParams
 
 
@@ -43,6 +43,9 @@ def _write_fields(mask: wp.array[wp.bool], writes: wp.array[Write]):
             write.float32[world, write.place] = value
         else:
             write.float64[world, write.place] = wp.float64(value)
+
+
+PRECISIONS = (torch.float32, torch.float64)
 
 
 class Change(NamedTuple):
@@ -82,9 +85,8 @@ class ModelFields:
         self._params, self._fields = params, fields  # the kernel's table knows the tensors by address alone
         changes = [*_body(model, params), *_motors(model, params)]
         writes = [write for change in changes for write in _writes(change, fields[change.field])]
-        table = wp.array(writes, dtype=Write, device=wp.device_from_torch(device))
         #: Gives the parameters of the worlds of a mask (N,) bool to their models.
-        self.write = MaskedLaunch(_write_fields, count, device, writes=table)
+        self.write = MaskedLaunch(_write_fields, count, device, writes=table(Write, writes, device))
 
 
 def _body(model: mujoco.MjModel, params: EngineParams) -> Iterator[Change]:
@@ -116,15 +118,14 @@ def _motors(model: mujoco.MjModel, params: EngineParams) -> Iterator[Change]:
     yield Change("dof_armature", (slice(6, None),), params.armature_scale, 0.0, model.dof_armature[6:])
 
 
-def _writes(change: Change, field: Tensor) -> Iterator[Write]:
-    """One for each number that changes."""
+def _writes(change: Change, field: Tensor) -> Iterator[dict[str, Any]]:
+    """Rows of :class:`Write`, one for each number that changes."""
     flat = field.view(field.shape[0], -1)
+    fields = {str(dtype).removeprefix("torch."): flat.new_empty(0, 0, dtype=dtype) for dtype in PRECISIONS}
+    fields[str(field.dtype).removeprefix("torch.")] = flat
     places = np.arange(flat.shape[1]).reshape(field.shape[1:])[change.where]
     bases, gains = (np.broadcast_to(np.asarray(values), places.shape).ravel() for values in (change.base, change.gain))
     params = change.param.view(flat.shape[0], -1).expand(-1, places.size).unbind(1)
     for param, place, base, gain in zip(params, places.ravel().tolist(), bases, gains, strict=True):
-        write = Write()
-        write.param, write.place, write.base, write.gain = share(param), place, float(base), float(gain)
-        write.inverse = int(change.inverse)
-        setattr(write, str(field.dtype).removeprefix("torch."), wp.from_torch(flat))
-        yield write
+        write = {"param": param, "place": place, "base": float(base), "gain": float(gain)}
+        yield write | {"inverse": int(change.inverse)} | fields

@@ -1,10 +1,24 @@
-"""What a ball met in a control step, and what it will meet: tensors of N worlds, and the kernels' structs of them."""
+"""A ball, what it met in a control step, and what it will meet: N worlds' tensors, and the kernels' structs of them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from pace.arrays.tensors import Bool, InfFloat, Int, NanFloat, NanVec3, Vec3, struct_of
+
+
+@dataclass(eq=False)
+class BallState:
+    """The ball of N worlds."""
+
+    position: Vec3  # m
+    velocity: Vec3  # m/s
+    spin: Vec3  # rad/s
+
+
+@struct_of(BallState)
+class BallArrays:
+    """:class:`BallState` as kernels see it."""
 
 
 @dataclass(frozen=True)
