@@ -75,8 +75,8 @@ def adaptations(runs: Sequence[Path], worlds: int) -> list[Adaptation]:
     """Every policy, and those with a memory without it too."""
     found = []
     for run in runs:
-        memory = load_policy(run).config.observation.memory
-        for forgetful in (False, True) if memory else (False,):
+        remembers = "last_return" in load_policy(run).config.observation.policy
+        for forgetful in (False, True) if remembers else (False,):
             found.append(adapt(run, worlds, forgetful))
             print(f"{found[-1].policy}: done", flush=True)
     return found

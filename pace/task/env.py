@@ -16,6 +16,8 @@ from pace.arrays.graph import CapturedCall, graphs_wanted
 from pace.arrays.state import restore, snapshot, under_prefix, with_prefix
 from pace.config.base import ConfigError
 from pace.config.task import TaskConfig
+from pace.onboard.actor import Predictor
+from pace.onboard.kinematics import PaddleChain
 from pace.sim.sensing import Sensing
 from pace.sim.worlds import Worlds
 from pace.task.game import Game
@@ -24,7 +26,6 @@ from pace.task.observations import (
     POLICY,
     ActorSignals,
     History,
-    Predictor,
     check_critic,
     check_policy,
     layout,
@@ -79,7 +80,7 @@ class TableTennisEnv(EnvBase):
     ) -> None:
         if num_worlds < 1:
             raise ConfigError(f"num_worlds must be at least 1, got {num_worlds}")
-        check_policy(config.observation, config.predictor)
+        check_policy(config)
         check_critic(config.observation.critic)
         worlds = worlds or Worlds(config, num_worlds, device)
         super().__init__(device=worlds.device, batch_size=(num_worlds,))
@@ -112,8 +113,7 @@ class TableTennisEnv(EnvBase):
         self._forecast_return = ball.forecaster(*struck, reward.target_x)
         self._forecast_serve = ball.forecaster(ball.position, ball.velocity, ball.spin, reward.target_x)
         self.rewards = RewardManager(reward, self.num_worlds, device, worlds.control_dt)
-        signals = (self.sensing, worlds.kinematics, worlds.nominal, self.task_state.action)
-        self.actor = ActorSignals(*signals, predictor, config.predictor, self.game.rules, config.observation)
+        self.actor = ActorSignals(config, self.sensing, self.task_state.action, PaddleChain(worlds.model), predictor)
 
     def _allocate(self) -> None:
         names, count, device = self.config.observation, self.num_worlds, self.worlds.device
@@ -179,9 +179,8 @@ class TableTennisEnv(EnvBase):
         self.game.clock.finish(self.serve_over)
         self._start_serves(next_serve)
         self.sensing.update(self.worlds.robot, self.worlds.ball.position, next_serve)
-        self.actor.track.update(self.sensing.ball_position, next_serve)
-        self._compute_signals()
-        self.actor.remember()
+        self.actor.step(next_serve)
+        self._compute_truth()
         self._policy_history.push()
         self._critic_history.push()
         self._flag_bad()
@@ -204,9 +203,8 @@ class TableTennisEnv(EnvBase):
         for action in (self.task_state.action, self.task_state.previous_action):
             action.masked_fill_(mask.unsqueeze(-1), 0.0)
         self.sensing.reset(mask, self.worlds.robot, self.worlds.ball.position)
-        self.actor.track.restart(mask, self.sensing.ball_position)
-        self._compute_signals(mask)
-        self.actor.forget(mask)
+        self.actor.begin(mask)
+        self._compute_truth()
         self._policy_history.fill(mask)
         self._critic_history.fill(mask)
 
@@ -229,10 +227,9 @@ class TableTennisEnv(EnvBase):
         self._forecast_serve(mask)
         self.game.start_serve(mask)
 
-    def _compute_signals(self, changed: Tensor | None = None) -> None:
-        """What both networks see, and what the predictor is taught, from the current state."""
+    def _compute_truth(self) -> None:
+        """What the critic sees and the predictor is taught, from the current state."""
         self.task_state.derive()
-        self.actor.compute(changed)
         target, now = self.game.target, self.game.clock.time
         torch.sub(target.apex_time, now, out=self.predictor_time_to_apex)
         truth = {"apex": target.apex, "target": target.point, "target_time": (target.time - now).unsqueeze(-1)}
@@ -273,12 +270,9 @@ class TableTennisEnv(EnvBase):
         return sums | {f"reward/{name}": value for name, value in terms.items()}
 
     def _parts(self) -> dict[str, object]:
-        kept = {name: getattr(self.actor, name) for name in ("memory", "delay", "attitude", "joints")}
-        return {name: part for name, part in kept.items() if part is not None} | {
+        return {
             "state": self.task_state,
             "sensing": self.sensing,
-            "track": self.actor.track,
-            "actor": self.actor,
             "policy": self._policy_history,
             "critic": self._critic_history,
             "rewards": self.rewards,
@@ -294,6 +288,7 @@ class TableTennisEnv(EnvBase):
         state |= with_prefix("game", self.game.state_dict())
         for name, part in self._parts().items():
             state |= with_prefix(name, snapshot(part))
+        state |= {name: value.clone() for name, value in self.actor.computed().items()}
         own = {f"env.{name}": getattr(self, name).clone() for name in OWN_TENSORS}
         return state | own | {"generator": self.generator.get_state()}
 
@@ -307,6 +302,8 @@ class TableTennisEnv(EnvBase):
         self.game.load_state_dict(under_prefix("game", state_dict))
         for name, part in self._parts().items():
             restore(part, under_prefix(name, state_dict))
+        for name, value in self.actor.computed().items():
+            value.copy_(state_dict[name])
         for name in OWN_TENSORS:
             getattr(self, name).copy_(state_dict[f"env.{name}"])
         self.generator.set_state(state_dict["generator"].cpu())

@@ -14,6 +14,7 @@ from torch import Tensor
 from pace.arrays.share import record, share, share_all
 from pace.arrays.state import restore, snapshot, under_prefix, with_prefix
 from pace.config.task import RewardConfig, ServeConfig, TaskConfig
+from pace.onboard.prediction import idle_point
 from pace.sim.ball.kernels import EventArrays, ForecastArrays
 from pace.task import game_kernels
 from pace.task.game_kernels import GameArrays, Rules
@@ -74,12 +75,6 @@ class Target(Part):
         self.arriving = torch.zeros(num_worlds, 3, device=device)
         self.apex_time = torch.zeros(num_worlds, device=device)
         self.time = torch.zeros(num_worlds, device=device)
-
-
-def idle_point(config: RewardConfig) -> list[float]:
-    """Target of the paddle (m, world frame) that belongs to the idle base position."""
-    idle_xy = [base - arm for base, arm in zip(config.idle_base_xy, config.arm_offset, strict=True)]
-    return [*idle_xy, config.idle_height]
 
 
 class ReturnForecast(Part):
@@ -167,7 +162,6 @@ def rules_of(config: TaskConfig) -> Rules:
     rules.arm_offset, rules.idle_base, rules.idle_point = reward.arm_offset, reward.idle_base_xy, idle_point(reward)
     for name in ("past_x", "low_z", "falling_x"):
         setattr(rules, name, reward.nothing_to_hit[name])
-    rules.moved = config.sensing.moved
     return rules
 
 

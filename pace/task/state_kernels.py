@@ -2,7 +2,8 @@
 
 import warp as wp
 
-from pace.task.game_kernels import LONGEST_TIME, GameArrays, Rules, something_to_hit_now
+from pace.onboard.prediction import LONGEST_TIME
+from pace.task.game_kernels import GameArrays, Rules, something_to_hit_now
 
 #: A foot that pushes with less touches nothing, N.
 CONTACT_FORCE = wp.constant(1.0)

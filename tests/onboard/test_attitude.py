@@ -10,12 +10,12 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from pace.onboard.steps import AttitudeEstimateStep
 from torch import Tensor
 
 from pace.config.base import ConfigError
 from pace.config.task import AttitudeEstimateConfig
 from pace.onboard.attitude import AttitudeEstimate
-from pace.onboard.steps import AttitudeEstimateStep
 from pace.task.env import make_env
 from pace.task.observations import check_policy
 from tests.helpers.estimates import check_observed_kept_and_begun

@@ -8,12 +8,12 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from pace.onboard.steps import DelayEstimateStep
 from torch import Tensor
 
 from pace.config.base import ConfigError
 from pace.config.task import DelayEstimateConfig
 from pace.onboard.delay import DelayEstimate
-from pace.onboard.steps import DelayEstimateStep
 from pace.task.env import make_env
 from pace.task.observations import check_policy
 from tests.helpers.fakes import config

@@ -9,12 +9,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from pace.onboard.steps import JointEstimateStep
 from scipy.linalg import solve_discrete_are
 
 from pace.config.base import ConfigError
 from pace.config.task import JointEstimateConfig
 from pace.onboard.joints import JointEstimate, steady_gain
-from pace.onboard.steps import JointEstimateStep
 from pace.task.env import make_env
 from pace.task.observations import check_policy
 from tests.helpers.estimates import check_observed_kept_and_begun

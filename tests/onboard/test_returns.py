@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import pytest
 import torch
+from pace.onboard.steps import ReturnMemoryStep
 from torch import Tensor
 
 from pace.config.base import ConfigError
 from pace.config.task import ReturnMemoryConfig
 from pace.onboard.returns import SEEN, ReturnMemory
-from pace.onboard.steps import ReturnMemoryStep
 from pace.sim.ball.aero import GRAVITY
 from pace.task.env import make_env
 from pace.task.observations import check_policy
