@@ -58,7 +58,7 @@ class PaddleChain(nn.Module):
         paddle = self.tip  # a point and a direction in the link's frame, (3, 2, N)
         for link in range(turns.shape[0] - 1, -1, -1):
             paddle = (turns[link].unsqueeze(2) * paddle).sum(1) + self.offsets[link]
-        paddle = _to_world(paddle, gravity, heading)
+        paddle = to_world(paddle, gravity, heading)
         return base_position + paddle[:, 0].T, paddle[:, 1].T
 
 
@@ -92,7 +92,7 @@ def _point_and_direction(point: np.ndarray, direction: np.ndarray) -> Tensor:
     return torch.tensor(pair, dtype=torch.float32)
 
 
-def _to_world(vectors: Tensor, gravity: Tensor, heading: Tensor) -> Tensor:
+def to_world(vectors: Tensor, gravity: Tensor, heading: Tensor) -> Tensor:
     """Vectors (3, K, N) of the body frame in the world frame: R = Rz Ry Rx, roll and pitch from gravity (N, 3), yaw
     from heading (N, 2)."""
     down, ahead = gravity.unbind(1), heading.unbind(1)
