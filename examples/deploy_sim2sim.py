@@ -5,8 +5,8 @@
 
 Needs onnxruntime, mujoco and numpy, and nothing of PACE but the MJCF in pace/sim/assets. One core is enough.
 
-:class:`Controller` is what a robot runs: it keeps the histories that the file wants, some of them of its own outputs,
-and calls it. The rest stands in for the world: :class:`Robot` is MuJoCo with the joints' position controllers and
+:class:`Controller` is what a robot runs: it calls the file with the current readings and with the state that the last
+call gave. The rest stands in for the world: :class:`Robot` is MuJoCo with the joints' position controllers and
 noisy, late sensors, :class:`Ball` a small model of flight and rebounds of its own. World frame: origin on the floor
 below the table's centre, x towards the opponent, y to the robot's left, z up. SI units.
 """
@@ -28,7 +28,7 @@ import onnxruntime
 import onnxruntime.capi.onnxruntime_pybind11_state as ort  # type: ignore[import-not-found]
 
 SCENE = Path(__file__).resolve().parent.parent / "pace" / "sim" / "assets" / "scene.xml"
-FORMAT = 2  # of the metadata that is understood here
+FORMAT = 3  # of the metadata that is understood here
 GRAVITY = np.array([0.0, 0.0, -9.81])  # m/s^2
 PHYSICS_DT = 0.002  # s
 BALL_DT = 0.001  # s: a ball at 10 m/s moves by half its radius
@@ -52,7 +52,7 @@ Frame = dict[str, np.ndarray]
 
 
 class Controller:
-    """The exported policy: one call a control step, from the sensors' present readings to joint targets.
+    """The exported policy: one call a control step, from the sensors' current readings to joint targets.
 
     Attributes: ``meta`` the file's metadata, ``control_dt`` s between calls, ``outputs`` of the last call by name.
     """
@@ -70,14 +70,11 @@ class Controller:
         self.control_dt = float(self.meta["control_dt"])
         self.outputs: Frame = {}
         self._names = [output.name for output in self._session.get_outputs()]
-        self._histories: Frame = {}
+        self.restart()
 
     def restart(self) -> None:
-        """Forget the past, earlier returns too: after a fall, with another paddle, not with every ball.
-
-        The next call fills every history with its frame, and what is kept of the calls before with zeros.
-        """
-        self._histories = {}
+        """Start from scratch, without earlier returns: after a fall, with another paddle, not with every ball."""
+        self._state = np.zeros((1, self.meta["inputs"]["state"]["size"]), dtype=np.float32)
 
     def __call__(self, readings: Mapping[str, Vector], new_ball: bool) -> Vector:
         """Joint targets (21,) rad, in the order of ``meta["joint_names"]``.
@@ -85,22 +82,12 @@ class Controller:
         Args: readings: the sensed inputs by name (``meta["inputs"]`` describes them), each of its own size;
         new_ball: this is the first frame in which a new ball is seen.
         """
-        if not self._histories:
-            self._fill(readings)
-        else:
-            frame = dict(readings) | {name: self.outputs[output] for name, output in self.meta["kept"].items()}
-            frame["ball_launched"] = np.array([float(new_ball)])
-            for name, history in self._histories.items():
-                history[0, :-1] = history[0, 1:].copy()
-                history[0, -1] = frame[name]
-        values = self._session.run(self._names, self._histories)
+        frame = {name: np.asarray(value, dtype=np.float32)[None] for name, value in readings.items()}
+        frame |= {"ball_launched": np.full((1, 1), new_ball, dtype=np.float32), "state": self._state}
+        values = self._session.run(self._names, frame)
         self.outputs = {name: np.asarray(value)[0] for name, value in zip(self._names, values, strict=True)}
+        self._state = self.outputs["state_next"][None]
         return self.outputs["joint_target"]
-
-    def _fill(self, readings: Mapping[str, Vector]) -> None:
-        for name, port in self.meta["inputs"].items():
-            self._histories[name] = np.zeros((1, *port["shape"]), dtype=np.float32)
-            self._histories[name][:] = readings.get(name, 0.0)
 
 
 class Blade(NamedTuple):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields
+from typing import Any
 
 from pace.config.base import Range, check_range, require
 from pace.config.predictor import PredictorConfig
@@ -153,15 +154,6 @@ class JointEstimateConfig:
             require(good, f"observation.joint_estimate.{name} must be positive and finite, got {value}")
 
 
-#: Numbers of the observation's configuration -> the actor's observations that need them.
-OBSERVED_FROM = {
-    "return_memory": ("last_return",),
-    "delay_estimate": ("sensed_delay",),
-    "attitude_estimate": ("estimated_gravity", "estimated_heading"),
-    "joint_estimate": ("estimated_joint_position", "estimated_joint_velocity"),
-}
-
-
 @dataclass
 class ObservationConfig:
     """Names of the observations of each network, in order, and how many control steps of history each sees."""
@@ -171,35 +163,25 @@ class ObservationConfig:
     critic: list[str]
     policy_history: int
     critic_history: int
-    # each needed by its observations of OBSERVED_FROM; the last two, observed, give the paddle's pose too
+    # numbers of the estimates (pace.onboard.estimates), each needed if the policy observes it
     return_memory: ReturnMemoryConfig | None = None
     delay_estimate: DelayEstimateConfig | None = None
     attitude_estimate: AttitudeEstimateConfig | None = None
     joint_estimate: JointEstimateConfig | None = None
+    estimates: dict[str, Any] = field(default_factory=dict)  # of those that are registered from outside, by their key
 
-    @property
-    def memory(self) -> ReturnMemoryConfig | None:
-        """Numbers of the memory of returns, where the policy observes it."""
-        return self.return_memory if self.observed_from("return_memory") else None
+    def built_in(self) -> dict[str, Any]:
+        """Numbers of the package's own estimates by key; ``None`` if they are not given."""
+        return {
+            "return_memory": self.return_memory,
+            "delay_estimate": self.delay_estimate,
+            "attitude_estimate": self.attitude_estimate,
+            "joint_estimate": self.joint_estimate,
+        }
 
-    @property
-    def delay(self) -> DelayEstimateConfig | None:
-        """Numbers of the estimate of the delay, where the policy observes it."""
-        return self.delay_estimate if self.observed_from("delay_estimate") else None
-
-    @property
-    def attitude(self) -> AttitudeEstimateConfig | None:
-        """Numbers of the filter of the orientation, where the policy observes it."""
-        return self.attitude_estimate if self.observed_from("attitude_estimate") else None
-
-    @property
-    def joints(self) -> JointEstimateConfig | None:
-        """Numbers of the filter of the joints, where the policy observes it."""
-        return self.joint_estimate if self.observed_from("joint_estimate") else None
-
-    def observed_from(self, numbers: str) -> list[str]:
-        """Which of the policy's observations need these numbers, a key of ``OBSERVED_FROM``."""
-        return [name for name in OBSERVED_FROM[numbers] if name in self.policy]
+    def numbers(self) -> dict[str, Any]:
+        """The same and those from outside, which are dictionaries until they are asked for."""
+        return self.estimates | self.built_in()
 
     def __post_init__(self) -> None:
         for name in ("policy", "critic"):

@@ -1,8 +1,9 @@
 """The policy as one ONNX file for the robot: written, described, and checked against torch.
 
-The file takes histories of raw sensor readings and gives joint targets: normaliser, predictor, forward kinematics and
-actor are in it (:mod:`pace.deploy.graph`). What the robot's own code needs besides lies in its metadata, as JSON. The
-file is played beside torch on observations recorded in the task, and only kept if both agree.
+The file takes one frame of raw sensor readings and a state, and gives joint targets and the next state: normaliser,
+predictor, estimates, forward kinematics and actor are in it (:mod:`pace.deploy.graph`). What else the robot's own code
+needs lies in its metadata, as JSON. The file is played beside torch on observations recorded in the task, and only kept
+if both agree.
 """
 
 from __future__ import annotations
@@ -25,7 +26,16 @@ from pace.config.base import parse, to_dict
 from pace.config.commands import ExportConfig
 from pace.config.overrides import ON_A_CPU
 from pace.config.training import TrainConfig
-from pace.deploy.graph import INPUTS, DeployedPolicy, input_ports, input_shapes, kept_outputs, output_ports
+from pace.deploy.graph import (
+    DeployedPolicy,
+    StateLayout,
+    input_ports,
+    joints_of,
+    output_ports,
+    readings,
+    state_parts,
+)
+from pace.onboard.estimate import columns
 from pace.rl.policies import TaskPolicy, load_policy
 from pace.runs.run_folder import VERSIONS, default_folder, git_state, versions
 from pace.sim.robot import build_model, joint_gains, motor_lines, nominal_pose
@@ -34,19 +44,17 @@ from pace.task.env import TableTennisEnv
 from pace.task.observations import POLICY, layout
 
 FILE = "policy.onnx"  # in the folder that the command writes
-FORMAT = 2  # of the metadata; 2: kept says which outputs the caller keeps
+FORMAT = 3  # of the metadata; 3: one frame of readings and one state
 ACTION_NOISE = 0.3  # standard deviation added to the actions while observations are recorded, so that they vary
 #: The check plays the task as saved, but for noise that is added to what the graph itself computes.
 CHECK_OVERRIDES = ("sensing.base_shift=0.0", *ON_A_CPU)
 #: What lies outside the file.
 PROCEDURE = (
-    "Run at 1 / control_dt Hz. Keep a history of each input, oldest frame first, and append a frame before each call: "
-    "of the inputs named in kept, the output of the last call that stands beside them there. At the start fill every "
-    "history with the first frame, but those of kept and ball_launched with 0. A new ball is a new track: set "
-    "ball_launched to 1 in the frame in which it is first seen. Without a ball in view, repeat its last position. "
-    "Start anew after a fall and with another paddle, not with every ball. Send joint_target to the position "
-    "controllers with the gains kp and kd. World frame: origin on the floor below the table's centre, x towards the "
-    "opponent, y to the robot's left, z up."
+    "Run at 1 / control_dt Hz: give the current readings, and as state the state_next of the call before. A state of "
+    "zeros starts from scratch: at the start, after a fall and with another paddle, not with every ball. Set "
+    "ball_launched to 1 in the step in which a new ball is first seen. Without a ball in view, repeat its last "
+    "position. Send joint_target to the position controllers with the gains kp and kd. World frame: origin on the "
+    "floor below the table's centre, x towards the opponent, y to the robot's left, z up."
 )
 
 Session = Any  # onnxruntime has no type information
@@ -67,11 +75,11 @@ def export_from_config(composed: DictConfig) -> None:
     out = folder / FILE
     differences = export_policy(policy, out, config)
     count = config.check_worlds * config.check_steps
-    units = output_ports(policy.config)
+    units = {name: port.unit for name, port in output_ports(policy.config).items()}
     print(f"policy {policy.source}")
     print(f"largest difference between onnxruntime and torch over {count:,} recorded observations:")
     for name, value in differences.items():
-        print(f"  {name:<20}{value:.1e} {units[name].unit}")
+        print(f"  {name:<20}{value:.1e} {units.get(name, '(state)')}")
     print(f"wrote {out} ({out.stat().st_size / 2**20:.2f} MiB)")
 
 
@@ -112,10 +120,8 @@ def _require_packages() -> None:
 
 def save_graph(graph: DeployedPolicy, config: TrainConfig, file: Path) -> None:
     """Write the graph as ONNX, for any number of robots in one call."""
-    example = tuple(torch.zeros(2, *shape) for shape in input_shapes(config).values())
+    example = tuple(torch.zeros(2, port.size) for port in input_ports(config).values())
     robots = torch.export.Dim("robots")
-    shapes = [{0: robots} for _ in example]
-    kept = tuple(shapes[len(INPUTS) :])  # one argument of forward, *kept
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it looks for torchvision, which nothing here needs
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="# The axis name: robots")  # it is the same axis of all inputs
@@ -126,7 +132,7 @@ def save_graph(graph: DeployedPolicy, config: TrainConfig, file: Path) -> None:
             dynamo=True,
             input_names=list(input_ports(config)),
             output_names=list(output_ports(config)),
-            dynamic_shapes=(*shapes[: len(INPUTS)], *((kept,) if kept else ())),
+            dynamic_shapes=tuple({0: robots} for _ in example),
             verbose=False,
         )
     assert program is not None
@@ -157,8 +163,6 @@ def metadata(policy: TaskPolicy, differences: Mapping[str, float], options: Expo
     lines = motor_lines(config.robot)
     max_speed, stall_torque = (None, None) if lines is None else lines.tolist()
     model = build_model(config.robot, config.engine, config.ball.table)
-    shapes = input_shapes(config)
-    columns = layout(config.observation.policy, POLICY)
     return {
         "format": FORMAT,
         "procedure": PROCEDURE,
@@ -174,12 +178,12 @@ def metadata(policy: TaskPolicy, differences: Mapping[str, float], options: Expo
         "action_scale": config.robot.action_scale,
         "action_clip": config.robot.action_clip,
         "control_dt": config.robot.control_dt,
-        "inputs": {name: {"shape": shapes[name], **port._asdict()} for name, port in input_ports(config).items()},
+        "inputs": {name: port._asdict() for name, port in input_ports(config).items()},
         "outputs": {name: port._asdict() for name, port in output_ports(config).items()},
-        "kept": kept_outputs(config),
+        "state": _describe_state(config),
         "observation": {
             "history": config.observation.policy_history,
-            "frame": {name: [where.start, where.stop] for name, where in columns.items()},
+            "frame": _ranges(layout(config.observation.policy, POLICY, joints_of(config))),
         },
         "sensing": {**to_dict(config.sensing), "distribution": "uniform, +- amplitude; delays in s"},
         "actuator_delay": config.randomization.actuator_delay,
@@ -191,6 +195,17 @@ def metadata(policy: TaskPolicy, differences: Mapping[str, float], options: Expo
         "versions": versions(),
         "check": {"largest_difference": dict(differences), **to_dict(options)},
     }
+
+
+def _describe_state(config: TrainConfig) -> dict[str, Any]:
+    """What stands in which columns of the state: for the curious, since nobody has to know it."""
+    parts = state_parts(config)
+    where = _ranges(columns(parts))
+    return {name: {"columns": where[name], "unit": p.unit, "meaning": p.meaning} for name, p in parts.items()}
+
+
+def _ranges(slices: Mapping[str, slice]) -> dict[str, list[int]]:
+    return {name: [where.start, where.stop] for name, where in slices.items()}
 
 
 def training_versions(policy: TaskPolicy) -> dict[str, Any] | None:
@@ -206,43 +221,36 @@ def training_versions(policy: TaskPolicy) -> dict[str, Any] | None:
 
 
 class RawReadings:
-    """The graph's inputs as a robot would keep them, from the sensors of an environment's N worlds.
+    """The graph's inputs as a robot would give them, from the sensors of an environment's N worlds.
 
-    Attributes: ``histories`` name -> (N, frames, size).
+    Attributes: ``state`` (N, S), of the last call.
     """
 
     def __init__(self, env: TableTennisEnv, config: TrainConfig) -> None:
-        self.env, self.kept = env, kept_outputs(config)
-        shapes = input_shapes(config)
-        self.histories = {name: torch.zeros(env.num_worlds, *shape) for name, shape in shapes.items()}
-        self.fill(torch.ones(env.num_worlds, dtype=torch.bool))
+        self._env, self._action = env, StateLayout(config).columns["action"]
+        self._launched = torch.zeros(env.num_worlds, 1)
+        self.state = torch.zeros(env.num_worlds, input_ports(config)["state"].size)
 
-    def read(self) -> dict[str, Tensor]:
-        """The present frame."""
-        env, sensing = self.env, self.env.sensing
-        names = ("base_angular_velocity", "base_position", "projected_gravity", "heading", "joint_velocity")
-        frame = {name: getattr(sensing, name) for name in (*names, "ball_position")}
-        frame["joint_position"] = sensing.joint_position + env.worlds.nominal
-        frame["previous_action"] = env.task_state.action
-        return frame
+    def push(self, new_ball: Tensor, state: NDArray[np.float32]) -> None:
+        """One control step later: ``new_ball`` (N,) bool, ``state`` (N, S) that the graph gave.
 
-    def push(self, new_ball: Tensor, outputs: Mapping[str, NDArray[np.float32]]) -> None:
-        """Append the present frame; ``new_ball`` (N,) bool, ``outputs`` of the graph's last call, each (N, size)."""
-        kept = {name: torch.from_numpy(outputs[output]) for name, output in self.kept.items()}
-        frame = kept | self.read() | {"ball_launched": new_ball.float().unsqueeze(-1)}  # the action is what was done
-        for name, history in self.histories.items():
-            history.copy_(torch.cat((history[:, 1:], frame[name].unsqueeze(1)), dim=1))
+        The action in it becomes the one that was done.
+        """
+        self._launched = new_ball.float().unsqueeze(1)
+        self.state = torch.from_numpy(state)
+        self.state[:, self._action] = self._env.task_state.action
 
-    def fill(self, mask: Tensor) -> None:
-        """Start anew in the worlds of ``mask`` (N,) bool."""
-        for name, value in self.read().items():
-            self.histories[name][mask] = value[mask].unsqueeze(1)
-        for name in ("ball_launched", *self.kept):
-            self.histories[name][mask] = 0.0
+    def restart(self, mask: Tensor) -> None:
+        """Start from scratch in the worlds of ``mask`` (N,) bool."""
+        self.state[mask] = 0.0
 
     def numpy(self) -> dict[str, NDArray[np.float32]]:
         """What onnxruntime takes."""
-        return {name: history.numpy() for name, history in self.histories.items()}
+        sensing = self._env.sensing
+        frame = {name: getattr(sensing, name) for name in readings(0) if name != "ball_launched"}
+        frame["joint_position"] = sensing.joint_position + self._env.worlds.nominal
+        frame |= {"ball_launched": self._launched, "state": self.state}
+        return {name: value.contiguous().numpy() for name, value in frame.items()}
 
 
 def open_session(file: Path) -> Session:
@@ -262,42 +270,35 @@ def compare(session: Session, policy: TaskPolicy, config: ExportConfig) -> dict[
     """
     env = policy.make_env(config.check_worlds, "cpu", config.seed, CHECK_OVERRIDES)
     readings, names = RawReadings(env, policy.config), list(output_ports(policy.config))
+    state = StateLayout(policy.config)
     generator = torch.Generator().manual_seed(config.seed)
-    largest = dict.fromkeys(names, 0.0)
+    largest: dict[str, float] = {}
     for _ in range(config.check_steps):
         found = dict(zip(names, session.run(None, readings.numpy()), strict=True))
+        kept = found["state_next"]
+        found |= {name: kept[:, state.columns[name]] for name in env.actor.estimates}
         action = policy(env.policy_observation)
-        expected = expected_outputs(env, policy, action)
-        for name, value in expected.items():
-            difference = float(np.abs(found[name][:, -value.shape[1] :] - value.numpy()).max())
-            largest[name] = difference if np.isnan(difference) else max(largest[name], difference)
+        for name, value in expected_outputs(env, policy, action).items():
+            difference = float(np.abs(found[name] - value.numpy()).max())
+            largest[name] = difference if np.isnan(difference) else max(largest.get(name, 0.0), difference)
         env.advance(action + ACTION_NOISE * torch.randn(action.shape, generator=generator))
         done = env.terminated | env.truncated
-        readings.push(env.game.ends.next_serve, found)
+        readings.push(env.game.ends.next_serve, kept)
         env.reset_worlds(done)
-        readings.fill(done)
-    return {name: largest[name] for name in expected_outputs(env, policy, policy(env.policy_observation))}
+        readings.restart(done)
+    return largest
 
 
 def expected_outputs(env: TableTennisEnv, policy: TaskPolicy, action: Tensor) -> dict[str, Tensor]:
-    """The graph's outputs by name, as far as the environment has them; of the memory its last numbers alone: the rest
-    differs after a reset, when the graph has seen the paddle once and the environment has not yet."""
+    """The graph's outputs by name, and the states of the estimates in its state, as the environment has them."""
     robot, actor = policy.config.robot, env.actor
     clipped = action.clamp(-robot.action_clip, robot.action_clip)
-    outputs = {
+    return {
         "joint_target": env.worlds.nominal + robot.action_scale * clipped,
         "action": clipped,
         "predicted_apex": actor.apex,
         "predicted_target": actor.target,
         "predicted_time": actor.time.unsqueeze(-1),
         "something_to_hit": actor.track.something_to_hit.float().unsqueeze(-1),
+        **actor.estimates,
     }
-    if actor.memory is not None:
-        outputs["return_memory_next"] = actor.memory.seen
-    if actor.delay is not None:
-        outputs["delay_estimate_next"] = actor.delay.state
-    if actor.attitude is not None:
-        outputs["attitude_next"] = actor.attitude.state
-    if actor.joints is not None:
-        outputs["joints_next"] = actor.joints.state
-    return outputs

@@ -3,39 +3,68 @@
 from __future__ import annotations
 
 import torch
-import warp as wp
+from torch import Tensor
+from torch.nn import functional
 
-from pace.arrays.share import share
 from pace.config.task import AttitudeEstimateConfig
-from pace.onboard.estimate import Estimate
-from pace.onboard.kernels import ATTITUDE_SIZE, DOWN, FORWARD, TURNING, estimate_attitude
-from pace.sim.sensing import Sensing
+from pace.onboard.estimate import Estimate, Part
+
+#: Squared horizontal part of gravity, in the body frame, at which the x axis points up or down and has no heading.
+SMALLEST_TILT = 1.0e-3
 
 
 class AttitudeEstimate(Estimate):
-    """A complementary filter of each world's orientation, as the inertial unit of a robot has it.
+    """A complementary filter of each robot's orientation, as the inertial unit of a robot has it.
 
-    Each control step the last estimate is turned on by the gyroscope, and ``gain`` of it is replaced by what is sensed.
+    Each control step the last estimate is turned by the gyroscope, and ``gain`` of it is replaced by what is sensed.
     With the paper's noise (gravity and heading +-0.05 a step, 0.03 in root mean square) and a gain of 0.1 gravity is
     known to 0.007, heading to 0.009: 0.8 m away, at the paddle, 7 mm instead of 24. A turn is known at once, however
-    late motion capture is.
+    late motion capture is. An episode begins with what is sensed.
 
-    Attributes: ``state`` (N, 9): all that is remembered (:func:`pace.onboard.kernels.estimate_attitude` has the
-    columns); in it ``gravity`` (N, 3) unit vectors, body frame, and ``heading`` (N, 2), the x axis of the trunk on the
-    ground; ``quat`` (N, 4) w, x, y, z, the base's orientation from both. A new episode begins with what is sensed.
-
-    Args:
-        config: numbers of the filter.
-        control_dt: s.
-        sensing: the robot's sensors.
+    Args: config: numbers of the filter; control_dt: s; joints: J.
     """
 
-    def __init__(self, config: AttitudeEstimateConfig, control_dt: float, sensing: Sensing) -> None:
-        turning = sensing.base_angular_velocity
-        count, device = turning.shape[0], turning.device
-        self.state = torch.zeros(count, ATTITUDE_SIZE, device=device)
-        self.gravity, self.heading = self.state[:, DOWN:FORWARD], self.state[:, FORWARD:TURNING]
-        self.quat = torch.zeros(count, 4, device=device)
-        sensed = [share(turning), share(sensing.projected_gravity), wp.from_torch(sensing.heading)]
-        kept = [wp.from_torch(self.state), wp.from_torch(self.quat, dtype=wp.vec4)]
-        super().__init__(estimate_attitude, [*sensed, control_dt, config.gain, *kept], count, device)
+    def __init__(self, config: AttitudeEstimateConfig, control_dt: float, joints: int) -> None:
+        super().__init__(joints)
+        self.gain, self.control_dt = config.gain, control_dt
+
+    @staticmethod
+    def parts(joints: int) -> dict[str, Part]:
+        """See :class:`Estimate`."""
+        return {
+            "known": Part(1, "1", "1"),
+            "gravity": Part(3, "1", "estimated direction of gravity, unit vector, body frame"),
+            "heading": Part(2, "1", "estimated x axis of the trunk on the ground, unit vector, world frame"),
+            "angular_velocity": Part(3, "rad/s", "the gyroscope's reading one step ago"),
+        }
+
+    def begin(self, base_angular_velocity: Tensor, projected_gravity: Tensor, heading: Tensor) -> Tensor:
+        """The state (N, 9) from (N, 3) rad/s and (N, 3), body frame, and (N, 2), world frame."""
+        return _state(projected_gravity, heading, base_angular_velocity)
+
+    def forward(
+        self, state: Tensor, base_angular_velocity: Tensor, projected_gravity: Tensor, heading: Tensor
+    ) -> Tensor:
+        """The state (N, 9) after this step; readings as those of :meth:`begin`."""
+        _, last, forward, turning = state.split([1, 3, 2, 3], dim=1)
+        mean = 0.5 * (base_angular_velocity + turning)
+        turned = last + self.control_dt * torch.linalg.cross(last, mean)
+        down = functional.normalize((1.0 - self.gain) * turned + self.gain * projected_gravity, dim=1)
+        angle = self.control_dt * yaw_rate(down, mean)
+        along = torch.cat((-forward[:, 1:], forward[:, :1]), dim=1)
+        swept = forward * torch.cos(angle) + along * torch.sin(angle)
+        return _state(down, (1.0 - self.gain) * swept + self.gain * heading, base_angular_velocity)
+
+
+def _state(gravity: Tensor, heading: Tensor, angular_velocity: Tensor) -> Tensor:
+    directions = (functional.normalize(gravity, dim=1), functional.normalize(heading, dim=1))
+    return torch.cat((torch.ones_like(gravity[:, :1]), *directions, angular_velocity), dim=1)
+
+
+def yaw_rate(gravity: Tensor, angular_velocity: Tensor) -> Tensor:
+    """How fast the trunk's x axis turns on the ground, (N, 1) rad/s, from (N, 3) each, body frame.
+
+    Rotation about that axis itself does not turn it.
+    """
+    tilt = gravity[:, 1:].square().sum(1, keepdim=True).clamp(min=SMALLEST_TILT)
+    return -(gravity[:, 1:] * angular_velocity[:, 1:]).sum(1, keepdim=True) / tilt

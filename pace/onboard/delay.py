@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import torch
-import warp as wp
+import math
 
-from pace.arrays.share import share
+import torch
+from torch import Tensor
+
 from pace.config.task import DelayEstimateConfig
-from pace.onboard.estimate import Estimate
-from pace.onboard.kernels import DELAY_SIZE, DelayRules, estimate_delay
-from pace.sim.sensing import Sensing
+from pace.onboard.attitude import yaw_rate
+from pace.onboard.estimate import Estimate, Part
 
 
 class DelayEstimate(Estimate):
-    """The delay of each world's motion capture, from the turns of its trunk since the episode began.
+    """The delay of each robot's motion capture, from the turns of its trunk since the episode began.
 
     The gyroscope reports a turn at once, motion capture ``delay`` seconds later: yaw(t) = psi(t) - delay * rate(t), as
     long as the rate changes little within the delay. Differences from step to step, smoothed by the same filter on both
@@ -24,29 +24,49 @@ class DelayEstimate(Estimate):
     and least squares over all steps, with a prior, is the estimate: (sum change * behind + prior * worth) /
     (sum change^2 + worth). One swing at 4 rad/s is worth as much as the prior and more.
 
-    Attributes: ``state`` (N, 8): all that is remembered (columns: :func:`pace.onboard.kernels.estimate_delay`);
-    ``seen`` (N, 1) s: the estimate minus the prior, its last column. A new episode begins with 0.
-
-    Args:
-        config: numbers of the estimate.
-        control_dt: s.
-        sensing: the robot's sensors.
+    Args: config: numbers of the estimate; control_dt: s; joints: J.
     """
 
-    def __init__(self, config: DelayEstimateConfig, control_dt: float, sensing: Sensing) -> None:
-        turning = sensing.base_angular_velocity
-        count, device = turning.shape[0], turning.device
-        self.state = torch.zeros(count, DELAY_SIZE, device=device)
-        self.seen = self.state[:, -1:]
-        arrays = [share(turning), share(sensing.projected_gravity), wp.from_torch(sensing.heading)]
-        inputs = [*arrays, delay_rules(config, control_dt), wp.from_torch(self.state)]
-        super().__init__(estimate_delay, inputs, count, device)
+    def __init__(self, config: DelayEstimateConfig, control_dt: float, joints: int) -> None:
+        super().__init__(joints)
+        self.config, self.control_dt = config, control_dt
+
+    @staticmethod
+    def parts(joints: int) -> dict[str, Part]:
+        """See :class:`Estimate`."""
+        return {
+            "known": Part(1, "1", "1"),
+            "yaw": Part(1, "rad", "sensed one step ago"),
+            "rate": Part(1, "rad/s", "of the yaw, one step ago"),
+            "behind": Part(1, "rad", "filtered: how far the yaw is behind what the rate says"),
+            "change": Part(1, "rad/s", "filtered: change of the rate"),
+            "products": Part(1, "rad^2/s", "sum of change times behind"),
+            "squares": Part(1, "rad^2/s^2", "sum of the squares of change"),
+            "delay": Part(1, "s", "estimated delay of motion capture above the prior"),
+        }
+
+    def begin(self, base_angular_velocity: Tensor, projected_gravity: Tensor, heading: Tensor) -> Tensor:
+        """The state (N, 8) from (N, 3) rad/s and (N, 3), body frame, and (N, 2), world frame; nothing is learned."""
+        yaw, rate = _yaw(heading), yaw_rate(projected_gravity, base_angular_velocity)
+        return torch.cat((torch.ones_like(yaw), yaw, rate, torch.zeros_like(yaw).expand(-1, 5)), dim=1)
+
+    def forward(
+        self, state: Tensor, base_angular_velocity: Tensor, projected_gravity: Tensor, heading: Tensor
+    ) -> Tensor:
+        """The state (N, 8) after this step; readings as those of :meth:`begin`."""
+        config = self.config
+        known, last_yaw, last_rate, behind, change, products, squares, _ = state.split(1, dim=1)
+        yaw, rate = _yaw(heading), yaw_rate(projected_gravity, base_angular_velocity)
+        turn = yaw - last_yaw
+        turn = turn - 2.0 * math.pi * torch.round(turn / (2.0 * math.pi))
+        said = 0.5 * self.control_dt * (rate + last_rate)
+        behind = config.smoothing * behind + said - turn
+        change = config.smoothing * change + rate - last_rate
+        products = config.fading * products + change * behind
+        squares = config.fading * squares + change.square()
+        delay = (products - config.prior * squares) / (squares + config.prior_worth)
+        return torch.cat((known, yaw, rate, behind, change, products, squares, delay), dim=1)
 
 
-def delay_rules(config: DelayEstimateConfig, control_dt: float) -> DelayRules:
-    """The numbers in the kernel's form."""
-    rules = DelayRules()
-    rules.control_dt = control_dt
-    rules.prior, rules.prior_worth = config.prior, config.prior_worth
-    rules.smoothing, rules.fading = config.smoothing, config.fading
-    return rules
+def _yaw(heading: Tensor) -> Tensor:
+    return torch.atan2(heading[:, 1:], heading[:, :1])

@@ -1,38 +1,53 @@
-"""What the robot works out over an episode from its sensors: a kernel over N worlds, and its beginning anew."""
+"""An estimate: what the robot works out over an episode, one control step at a time."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Mapping
+from itertools import accumulate
+from typing import NamedTuple
 
-import torch
-import warp as wp
-from torch import Tensor
-
-from pace.arrays.share import record, share
+from torch import Tensor, nn
 
 
-class Estimate:
-    """A kernel that goes one control step on in all worlds, or begins anew in those of a mask.
+class Part(NamedTuple):
+    """Columns of an estimate's state: how many, their unit and what they mean."""
 
-    Args:
-        kernel: its first arguments are the mask and whether it is a restart, 0 or 1.
-        inputs: its other arguments.
-        count: N.
-        device: of the worlds.
+    size: int
+    unit: str
+    meaning: str
+
+
+class Estimate(nn.Module):
+    """Base of the estimates: the state (N, ``size``) of each robot before a control step -> after it.
+
+    An estimate is made of (its numbers, control_dt s, number of joints J). It has three methods:
+
+    - :meth:`parts`, the columns of its state, in order;
+    - ``begin(**signals)``: the state (N, ``size``) when an episode begins, from its first readings;
+    - ``forward(state, **signals)``: the state after one more control step.
+
+    The signals are those that its entry in :data:`pace.onboard.estimates.ESTIMATES` names, as keyword arguments. Both
+    are pure: they write into no argument, read no value on the host and use operators that ONNX knows.
+
+    Attributes: ``columns`` part -> columns of the state; ``size``.
     """
 
-    def __init__(self, kernel: wp.Kernel, inputs: list[Any], count: int, device: torch.device) -> None:
-        self._mask = torch.zeros(count, dtype=torch.bool, device=device)
-        mask = share(self._mask)
-        self._update: Callable[[], None] = record(kernel, count, [mask, 0, *inputs], device)
-        self._restart: Callable[[], None] = record(kernel, count, [mask, 1, *inputs], device)
+    def __init__(self, joints: int) -> None:
+        super().__init__()
+        self.columns = columns(self.parts(joints))
+        self.size = max(where.stop for where in self.columns.values())
 
-    def update(self) -> None:
-        """One control step later: the sensors' signals are new."""
-        self._update()
+    @staticmethod
+    def parts(joints: int) -> dict[str, Part]:
+        """The state's parts by name, in the order of their columns, for a robot with so many joints."""
+        raise NotImplementedError
 
-    def restart(self, mask: Tensor) -> None:
-        """Forget everything in the worlds of ``mask`` (N,) bool, and begin with what they sense now."""
-        self._mask.copy_(mask)
-        self._restart()
+    def begin(self, **signals: Tensor) -> Tensor:
+        """The state at the start of an episode."""
+        raise NotImplementedError
+
+
+def columns(parts: Mapping[str, Part]) -> dict[str, slice]:
+    """Columns of each part, one beside the other."""
+    ends = accumulate(part.size for part in parts.values())
+    return {name: slice(end - part.size, end) for (name, part), end in zip(parts.items(), ends, strict=True)}

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-import warp as wp
 from numpy.typing import NDArray
+from torch import Tensor
 
 from pace.config.task import JointEstimateConfig
-from pace.onboard.estimate import Estimate
-from pace.onboard.kernels import FIRST_JOINT, estimate_joints
-from pace.sim.sensing import Sensing
+from pace.onboard.estimate import Estimate, Part
 
 SETTLED = 1e-12  # relative change of the filter's covariance at which its gain is taken
 LONGEST = 100_000  # control steps that it may take to settle
@@ -20,33 +18,44 @@ class JointEstimate(Estimate):
     """A Kalman filter of each joint, which moves on at the velocity it has: steady gains, no model of the robot.
 
     With the paper's noise (+-0.01 rad and +-1.5 rad/s, 0.0058 and 0.87 in root mean square) joints of a robot that
-    plays are known to 0.0053 rad and 0.47 rad/s, with twice the noise to 0.010 and 0.77 (of 0.012 and 1.7).
+    plays are known to 0.0053 rad and 0.47 rad/s, with twice the noise to 0.010 and 0.77 (of 0.012 and 1.7). An episode
+    begins with what is sensed.
 
-    Attributes: ``state`` (N, 1 + 2 J): 1 once anything was seen, then ``position`` (N, J) rad relative to the nominal
-    pose and ``velocity`` (N, J) rad/s. A new episode begins with what is sensed.
-
-    Args:
-        config: numbers of the filter.
-        control_dt: s.
-        sensing: the robot's sensors.
+    Args: config: numbers of the filter; control_dt: s; joints: J.
     """
 
-    def __init__(self, config: JointEstimateConfig, control_dt: float, sensing: Sensing) -> None:
-        sensed = sensing.joint_position
-        count, joints = sensed.shape
-        self.state = torch.zeros(count, FIRST_JOINT + 2 * joints, device=sensed.device)
-        self.position, self.velocity = self.state[:, FIRST_JOINT:].split(joints, dim=1)
-        gain = wp.mat22(*steady_gain(config, control_dt).ravel().tolist())
-        readings = [wp.from_torch(sensed), wp.from_torch(sensing.joint_velocity)]
-        super().__init__(
-            estimate_joints, [*readings, control_dt, gain, wp.from_torch(self.state)], count, sensed.device
-        )
+    def __init__(self, config: JointEstimateConfig, control_dt: float, joints: int) -> None:
+        super().__init__(joints)
+        self.control_dt = control_dt
+        (self.near, self.nudge), (self.pull, self.follow) = steady_gain(config, control_dt).tolist()
+
+    @staticmethod
+    def parts(joints: int) -> dict[str, Part]:
+        """See :class:`Estimate`."""
+        return {
+            "known": Part(1, "1", "1"),
+            "position": Part(joints, "rad", "estimated positions, relative to the nominal pose"),
+            "velocity": Part(joints, "rad/s", "estimated velocities"),
+        }
+
+    def begin(self, joint_position: Tensor, joint_velocity: Tensor) -> Tensor:
+        """The state (N, 1 + 2 J) from (N, J) rad, relative to the nominal pose, and (N, J) rad/s."""
+        return torch.cat((torch.ones_like(joint_position[:, :1]), joint_position, joint_velocity), dim=1)
+
+    def forward(self, state: Tensor, joint_position: Tensor, joint_velocity: Tensor) -> Tensor:
+        """The state (N, 1 + 2 J) after this step; readings as those of :meth:`begin`."""
+        last, speed = state[:, self.columns["position"]], state[:, self.columns["velocity"]]
+        said = last + self.control_dt * speed
+        off, faster = joint_position - said, joint_velocity - speed
+        position = said + self.near * off + self.nudge * faster
+        velocity = speed + self.pull * off + self.follow * faster
+        return torch.cat((state[:, :1], position, velocity), dim=1)
 
 
 def steady_gain(config: JointEstimateConfig, control_dt: float) -> NDArray[np.float64]:
     """Kalman gain (2, 2) after many control steps: what position and velocity gain from either's innovation.
 
-    Between two of them a joint is accelerated by a constant, drawn anew each time with root mean square
+    Between two of them a joint is accelerated by a constant, sampled independently each time with root mean square
     ``config.acceleration``. Source: Bar-Shalom, Li and Kirubarajan 2001, section 6.3.2.
     """
     step = np.array([[1.0, control_dt], [0.0, 1.0]])

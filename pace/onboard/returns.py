@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
-import warp as wp
 from torch import Tensor
 
-from pace.arrays.share import record, share
 from pace.config.task import ReturnMemoryConfig
-from pace.onboard.kernels import MEMORY_SIZE, MemoryRules, remember_return
+from pace.onboard.estimate import Estimate, Part
+from pace.sim.ball.aero import GRAVITY
 
-#: Numbers that the actor sees: velocity of the last return 3, restitution above the prior 1, share of hits 1.
-SEEN = 5
+#: Frames of the ball's track that a hit is estimated from.
+FRAMES = 5
 
 
-class ReturnMemory:
-    """The returns of each world's robot since its episode began, from sensed signals alone.
+class ReturnMemory(Estimate):
+    """The returns of each robot since its episode began, from sensed signals alone.
 
     A ball that is first seen moving away near the paddle was hit about one control step before. Its sensed positions
     give its velocity before (from four to two steps before it was seen to turn) and after (the two steps from then on),
@@ -29,48 +26,74 @@ class ReturnMemory:
     of its paddle and ball. Single estimates are rough: noise of the ball's positions alone is worth 0.03, and the
     paddle's velocity changes within the step in which the hit falls.
 
-    Attributes: ``seen`` (N, 5): velocity of the last return m/s, world frame (0 before the first), estimated
-    restitution minus the prior, hits that it is the mean of as a share of ``config.hits``; ``state`` (N, 24): all that
-    is remembered, ``seen`` in its last columns (:func:`pace.onboard.kernels.remember_return` has the others). A new
-    episode begins with zeros.
-
-    Args:
-        config: numbers of the estimate.
-        control_dt: s.
-        track: (N, 3 * frames) m, at least five frames: the ball's sensed positions, oldest first.
-        turned: (N,) bool, the ball has been seen moving away.
-        paddle_position, paddle_normal: (N, 3) m and unit vectors, from forward kinematics.
+    Args: config: numbers of the estimate; control_dt: s; joints: J.
     """
 
-    def __init__(
-        self,
-        config: ReturnMemoryConfig,
-        control_dt: float,
-        track: Tensor,
-        turned: Tensor,
-        paddle_position: Tensor,
-        paddle_normal: Tensor,
-    ) -> None:
-        count, device = turned.shape[0], turned.device
-        self.state = torch.zeros(count, MEMORY_SIZE, device=device)
-        self.seen = self.state[:, -SEEN:]
-        arrays = [wp.from_torch(track), share(turned), share(paddle_position), share(paddle_normal)]
-        inputs = [*arrays, memory_rules(config, control_dt), wp.from_torch(self.state)]
-        self._update: Callable[[], None] = record(remember_return, count, inputs, device)
+    fall: Tensor
 
-    def update(self) -> None:
-        """One control step later: ball, paddle and whether the ball has turned are new."""
-        self._update()
+    def __init__(self, config: ReturnMemoryConfig, control_dt: float, joints: int) -> None:
+        super().__init__(joints)
+        self.config, self.span = config, 2.0 * control_dt
+        # in the two steps to the hit, and from it
+        self.register_buffer("fall", torch.tensor([0.0, 0.0, self.span * GRAVITY]), persistent=False)
 
-    def restart(self, mask: Tensor) -> None:
-        """Forget everything in the worlds of ``mask`` (N,) bool."""
-        self.state.masked_fill_(mask.unsqueeze(-1), 0.0)
+    @staticmethod
+    def parts(joints: int) -> dict[str, Part]:
+        """See :class:`Estimate`."""
+        return {
+            "age": Part(1, "1", "control steps since the ball was seen to turn, at most 4; 0: it has not turned"),
+            "last_position": Part(3, "m", "paddle one step ago, world frame"),
+            "second_last_position": Part(3, "m", "paddle two steps ago"),
+            "last_normal": Part(3, "1", "normal of the paddle one step ago"),
+            "hit": Part(9, "m/s, m/s, 1", "velocity of the ball before the hit and of the paddle, and its normal"),
+            "last_return": Part(
+                5,
+                "m/s, 1, 1",
+                "velocity of the last return, world frame (0 before the first); estimated restitution minus the prior; "
+                "hits that it is the mean of, as a share of observation.return_memory.hits",
+            ),
+        }
 
+    def begin(self, track: Tensor, turned: Tensor, paddle_position: Tensor, paddle_normal: Tensor) -> Tensor:
+        """The state (N, 24): zeros."""
+        return paddle_position.new_zeros(1, self.size).expand(paddle_position.shape[0], -1)
 
-def memory_rules(config: ReturnMemoryConfig, control_dt: float) -> MemoryRules:
-    """The numbers in the kernel's form."""
-    rules = MemoryRules()
-    rules.control_dt = control_dt
-    rules.prior, rules.prior_hits, rules.hits = config.prior, config.prior_hits, config.hits
-    rules.reach, rules.closing_speed, rules.largest = config.reach, config.closing_speed, config.largest
-    return rules
+    def forward(
+        self, state: Tensor, track: Tensor, turned: Tensor, paddle_position: Tensor, paddle_normal: Tensor
+    ) -> Tensor:
+        """The state (N, 24) after this step.
+
+        Args: state (N, 24) before it; track (N, 3 * frames) m, the ball's last positions, oldest first; turned (N,)
+        bool, the ball has been seen moving away; position (N, 3) m and normal (N, 3) of the paddle.
+        """
+        last_age, last, second_last, last_normal, last_hit, seen = state.split([1, 3, 3, 3, 9, 5], dim=1)
+        ball = track.unflatten(1, (-1, 3))
+        newest, speed = ball[:, -1], (ball[:, -1] - ball[:, -3]) / self.span
+        age = torch.where(turned.unsqueeze(1), (last_age + 1.0).clamp(max=4.0), 0.0)
+        turning, leaving = age == 1.0, age == 3.0
+        before = (ball[:, -3] - ball[:, -5]) / self.span - self.fall
+        swing = (paddle_position - second_last) / self.span
+        hit = torch.where(turning, torch.cat((before, swing, last_normal), dim=1), last_hit)
+        far = (newest - paddle_position).square().sum(1, keepdim=True).sqrt() > self.config.reach
+        age = torch.where(turning & far, 4.0, age)  # not the paddle turned it
+        seen = torch.where(leaving, self._learn(hit, speed, seen), seen)
+        return torch.cat((age, paddle_position, last, paddle_normal, hit, seen), dim=1)
+
+    def _learn(self, hit: Tensor, after: Tensor, seen: Tensor) -> Tensor:
+        """``last_return`` (N, 5) with one more estimate.
+
+        Args: hit (N, 9): velocity of the ball before it and of the paddle, m/s, and the paddle's normal; after (N, 3)
+        m/s, velocity of the return; seen (N, 5) so far.
+        """
+        config = self.config
+        before, paddle, normal = hit.split(3, dim=1)
+        restitution, share = seen[:, 3:4], seen[:, 4:5]
+        closing = ((before - paddle) * normal).sum(1, keepdim=True)
+        parting = ((after + self.fall - paddle) * normal).sum(1, keepdim=True)
+        fast = closing.abs() >= config.closing_speed
+        estimate = (-parting / torch.where(fast, closing, 1.0)).clamp(0.0, config.largest)
+        hits = (share * config.hits).clamp(max=config.hits - 1.0)  # older ones fade once there are that many
+        weight = hits + config.prior_hits
+        mean = (restitution * weight + estimate - config.prior) / (weight + 1.0)
+        learned = torch.cat((mean, (hits + 1.0) / config.hits), dim=1)
+        return torch.cat((after, torch.where(fast, learned, seen[:, 3:])), dim=1)

@@ -20,7 +20,8 @@ from pace.predictor.network import BallPredictor, make_predictor
 from pace.rl.agent import Sizes
 from pace.rl.algorithm import ALGORITHMS
 from pace.runs.checkpoint import META, TRAINING, WEIGHTS, Checkpoint, CheckpointError, load_checkpoint, load_weights
-from pace.task.observations import JOINTS, POLICY
+from pace.sim.robot_spec import RobotSpec
+from pace.task.observations import POLICY, width
 
 if TYPE_CHECKING:
     from pace.task.env import TableTennisEnv
@@ -45,7 +46,7 @@ class TaskPolicy:
 
     @torch.no_grad()
     def __call__(self, observation: Tensor) -> Tensor:
-        """Raw observation (N, Dp) -> action (N, 21), deterministic for a saved policy."""
+        """Raw observation (N, Dp) -> action (N, J), deterministic for a saved policy."""
         return self.act(observation)
 
     def to(self, device: str | torch.device) -> TaskPolicy:
@@ -97,7 +98,7 @@ def load_policy(path: str | Path, device: str | torch.device = "cpu") -> TaskPol
     """
     checkpoint = load_checkpoint(locate(path), weights_only=True)
     config, source = saved_config(checkpoint), str(checkpoint.path)
-    sizes = Sizes(policy_size(config), 0, JOINTS)
+    sizes = Sizes(policy_size(config), 0, len(RobotSpec.of(config.robot).joints))
     with _outside_named(source):
         algorithm = ALGORITHMS[config.algo.algorithm]
     network = algorithm.load_policy(_part(checkpoint, "agent"), sizes, config.algo, source)
@@ -159,10 +160,10 @@ def saved_config(checkpoint: Checkpoint) -> TrainConfig:
 
 def policy_size(config: TrainConfig) -> int:
     """Numbers in the actor's observation: those of a frame, times its history."""
-    size = 0
+    size, joints = 0, len(RobotSpec.of(config.robot).joints)
     for name in config.observation.policy:
         with _outside_named(f"the policy observes '{name}', which this version of pace does not know"):
-            size += POLICY[name].size
+            size += width(POLICY[name].size, joints)
     return config.observation.policy_history * size
 
 
@@ -180,14 +181,14 @@ def built_in_policy(name: str, seed: int, like: TaskPolicy | None = None, device
     from pace.config.training import load_train_config
 
     config, predictor = (like.config, like.predictor) if like else (load_train_config(), None)
-    where = resolve_device(device)
+    where, joints = resolve_device(device), len(RobotSpec.of(config.robot).joints)
     generator = torch.Generator(where).manual_seed(seed)
 
     def zero(observation: Tensor) -> Tensor:
-        return observation.new_zeros(observation.shape[0], JOINTS)
+        return observation.new_zeros(observation.shape[0], joints)
 
     def random(observation: Tensor) -> Tensor:
-        shape = (observation.shape[0], JOINTS)
+        shape = (observation.shape[0], joints)
         return torch.randn(shape, device=where, generator=generator).mul_(RANDOM_STD)
 
     if name not in ("zero", "random"):

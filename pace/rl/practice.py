@@ -7,6 +7,7 @@ from torch import Tensor
 
 from pace.arrays.tensors import allocate
 from pace.config.training import TrainConfig
+from pace.onboard.ball_track import BallTrack
 from pace.sim.ball.ball import BallParams, BallSim
 from pace.sim.engine.base import EngineParams
 from pace.sim.randomization import Randomizer
@@ -14,7 +15,6 @@ from pace.sim.robot import build_model
 from pace.sim.robot_state import RobotState
 from pace.sim.sensing import Sensing
 from pace.task.game import Game
-from pace.task.observations import BallTrack
 from pace.task.resets import ServeSampler
 
 SPREAD_STEPS = 50  # control steps, about as long as a serve
@@ -51,13 +51,13 @@ class ServePractice:
         self._randomizer = self._make_randomizer()
         self._serves = ServeSampler(config.serve, count, self.generator, device)
         self._game = Game(config, self.ball, torch.tensor(STANDING, device=device).repeat(count, 1))
-        self._track = BallTrack(config.predictor.frames, self._game.rules, count, device)
+        self._track = BallTrack(config)
         self._path = torch.full((count, 2, 12), FAR_AWAY, device=device)
         self._path[:, :, 3:] = torch.tensor([1.0, *[0.0] * 8], device=device)  # a unit normal, at rest
         self._robot = allocate(RobotState, count, device, joints=0, feet=0, bodies=0)
         joints = torch.zeros(0, device=device)
         self.sensing = Sensing(config.sensing, count, device, config.robot.control_dt, joints, self.generator)
-        self.predictor_input = self._track.positions
+        self.predictor_input = torch.zeros(count, 3 * config.predictor.frames, device=device)
         self.serve_over = self._game.ends.over
         self._serve(torch.ones(count, dtype=torch.bool, device=device))
         self._sense(torch.ones(count, dtype=torch.bool, device=device))
@@ -98,7 +98,8 @@ class ServePractice:
     def _sense(self, new_ball: Tensor) -> None:
         self.sensing.update(self._robot, self.ball.position, new_ball)
         self.sensing.reset(new_ball, self._robot, self.ball.position)
-        self._track.update(self.sensing.ball_position, new_ball)
+        sensed = self.sensing.ball_position
+        self.predictor_input.copy_(self._track.append(self.predictor_input, sensed, new_ball))
         target, now = self._game.target, self._game.clock.time
         parts = {"apex": target.apex, "target": target.point, "target_time": (target.time - now).unsqueeze(-1)}
         self.predictor_target = torch.cat([parts[name] for name in self.config.predictor.outputs], dim=1)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from pace.evaluation.serves import COLUMNS, C, ServeRecorder, play, wilson
 from pace.rl.policies import TaskPolicy, load_policy
+from pace.sim.robot_spec import RobotSpec
 from pace.studies.common import COLOURS, ENDLESS, markdown
 from pace.task.env import TableTennisEnv
 from pace.task.observations import POLICY, layout
@@ -39,7 +40,7 @@ class Forgetful:
 
     def __init__(self, policy: TaskPolicy) -> None:
         names, frames = policy.config.observation.policy, policy.config.observation.policy_history
-        columns = layout(names, POLICY)["last_return"]
+        columns = layout(names, POLICY, len(RobotSpec.of(policy.config.robot).joints))["last_return"]
         self._policy, self._frames, self._columns = policy, frames, columns
 
     def __call__(self, observation: Tensor) -> Tensor:
@@ -75,8 +76,8 @@ def adaptations(runs: Sequence[Path], worlds: int) -> list[Adaptation]:
     """Every policy, and those with a memory without it too."""
     found = []
     for run in runs:
-        memory = load_policy(run).config.observation.memory
-        for forgetful in (False, True) if memory else (False,):
+        remembers = "last_return" in load_policy(run).config.observation.policy
+        for forgetful in (False, True) if remembers else (False,):
             found.append(adapt(run, worlds, forgetful))
             print(f"{found[-1].policy}: done", flush=True)
     return found

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from omegaconf import DictConfig
 from torch import Tensor
 
+from pace.arrays.launch import Launch
 from pace.config.base import parse
 from pace.config.commands import ValidateConfig
 from pace.runs.run_folder import default_folder

@@ -10,9 +10,11 @@ import torch
 from torch import Tensor
 
 from pace.config.base import ConfigError
+from pace.onboard.estimates import observed
 from pace.rl.policies import TaskPolicy, load_policy
 from pace.studies.common import ENDLESS, markdown
 from pace.task.env import TableTennisEnv
+from pace.task.observations import POLICY
 
 TIMES = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)  # s since the episode began
 SEED = 5
@@ -22,7 +24,11 @@ COLUMNS = (
     "delay, ms", "gravity sensed, mrad", "estimated", "heading sensed, mrad", "estimated", "joints sensed, mrad",
     "estimated", "joints sensed, rad/s", "estimated", "paddle sensed, mm", "estimated",
 )  # fmt: skip
-NEEDED = ("delay", "attitude", "joints")
+NEEDED = {"delay", "attitude", "joints"}  # of pace.onboard.estimates
+
+ESTIMATED = (
+    "sensed_delay", "estimated_gravity", "estimated_heading", "estimated_joint_position", "estimated_joint_velocity",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -37,7 +43,7 @@ def sense(run: Path, worlds: int) -> Senses:
     """Play ``worlds`` robots for the longest of ``TIMES``. Errors: :class:`ConfigError` for a policy that does not
     estimate them."""
     policy = load_policy(run)
-    if any(getattr(policy.config.observation, name) is None for name in NEEDED):
+    if not observed(policy.config.observation).keys() >= NEEDED:
         raise ConfigError(f"{run} does not observe its delay, orientation and joints: give one of observation=memory")
     env = policy.make_env(worlds, "cpu", SEED, [*ENDLESS, *TASK])
     steps = [round(time / env.worlds.control_dt) for time in TIMES]
@@ -58,17 +64,16 @@ def _play(env: TableTennisEnv, policy: TaskPolicy, steps: Sequence[int]) -> list
 def errors(env: TableTennisEnv) -> list[Tensor]:
     """Each world's error (N, size) of every column, in its unit; their norms count."""
     sensing, actor, robot = env.sensing, env.actor, env.worlds.robot
-    observation = env.config.observation
-    assert actor.delay is not None
-    assert actor.attitude is not None
-    assert actor.joints is not None
-    assert observation.delay_estimate is not None
-    delay = actor.delay.seen + observation.delay_estimate.prior - (sensing.delay * env.worlds.control_dt).unsqueeze(1)
-    gravity = [given - robot.projected_gravity for given in (sensing.projected_gravity, actor.attitude.gravity)]
-    heading = [_angle(given, robot.heading) for given in (sensing.heading, actor.attitude.heading)]
+    prior = env.config.observation.delay_estimate
+    assert prior is not None  # sense() has checked it
+    estimated = {name: POLICY[name].function(actor) for name in ESTIMATED}
+    delay = estimated["sensed_delay"] + prior.prior - (sensing.delay * env.worlds.control_dt).unsqueeze(1)
+    gravity = [given - robot.projected_gravity for given in (sensing.projected_gravity, estimated["estimated_gravity"])]
+    heading = [_angle(given, robot.heading) for given in (sensing.heading, estimated["estimated_heading"])]
     joints = robot.joint_position - env.worlds.nominal
-    bent = [given - joints for given in (sensing.joint_position, actor.joints.position)]
-    moving = [given - robot.joint_velocity for given in (sensing.joint_velocity, actor.joints.velocity)]
+    bent = [given - joints for given in (sensing.joint_position, estimated["estimated_joint_position"])]
+    velocities = (sensing.joint_velocity, estimated["estimated_joint_velocity"])
+    moving = [given - robot.joint_velocity for given in velocities]
     each = sensing.joint_position.shape[1] ** -0.5  # of one joint
     paddle = [position - robot.paddle_position for position in (_sensed_paddle(env), actor.paddle_position)]
     in_milli = [[1e3 * error for error in pair] for pair in (gravity, heading, bent, paddle)]
@@ -85,7 +90,7 @@ def _sensed_paddle(env: TableTennisEnv) -> Tensor:
     """(N, 3) m, by forward kinematics from what is sensed alone."""
     sensing = env.sensing
     joints = sensing.joint_position + env.worlds.nominal
-    return env.worlds.kinematics.paddle_pose(sensing.base_position, sensing.base_quat, joints)[0]
+    return env.actor.onboard.paddle(sensing.base_position, sensing.projected_gravity, sensing.heading, joints)[0]
 
 
 def table(found: Senses) -> str:

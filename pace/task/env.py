@@ -16,56 +16,28 @@ from pace.arrays.graph import CapturedCall, graphs_wanted
 from pace.arrays.state import Stateful, tensors_named, under_prefix, with_prefix
 from pace.config.base import ConfigError
 from pace.config.task import TaskConfig
+from pace.onboard.actor import Predictor
+from pace.onboard.kinematics import PaddleChain
 from pace.sim.ball.state import BallState
 from pace.sim.sensing import Sensing
 from pace.sim.worlds import Worlds
 from pace.task.game import Game
-from pace.task.observations import (
-    CRITIC,
-    POLICY,
-    ActorSignals,
-    History,
-    Predictor,
-    check_critic,
-    check_policy,
-    layout,
-)
+from pace.task.history import History
+from pace.task.observations import CRITIC, POLICY, check_critic, check_policy, layout
 from pace.task.resets import HeadStart, PoseSampler, ServeSampler
 from pace.task.rewards import RewardManager
+from pace.task.signals import ActorSignals
 from pace.task.state import TaskState
 from pace.task.statistics import Statistics
 
 #: The environment's own part of its state; the rest belongs to its parts.
 OWN_TENSORS = ("predictor_target", "predictor_time_to_apex", "_bad")
-#: State of what the robot computes on board and of the histories, which do not declare it themselves.
-ONBOARD_STATE = {
-    "memory": ("state",),
-    "delay": ("state",),
-    "attitude": ("state", "quat"),
-    "joints": ("state",),
-    "track": ("positions", "turned", "something_to_hit"),
-    "actor": (
-        "_base_quat",
-        "_joints",
-        "_nominal",
-        "action",
-        "apex",
-        "paddle_normal",
-        "paddle_position",
-        "prediction",
-        "shift",
-        "target",
-        "time",
-    ),
-    "policy": ("frame", "observation"),
-    "critic": ("frame", "observation"),
-}
 
 
 class TableTennisEnv(EnvBase):
     """N worlds of a humanoid that returns serves; batch size [N].
 
-    As a TorchRL environment: ``policy`` (N, Dp) and ``critic`` (N, Dc) float32 observations, ``action`` (N, 21) in
+    As a TorchRL environment: ``policy`` (N, Dp) and ``critic`` (N, Dc) float32 observations, ``action`` (N, J) in
     units of ``robot.action_scale`` rad from the nominal pose, ``reward``, ``terminated``, ``truncated`` and ``done``
     (N, 1). Under it lies an in-place interface without copies, :meth:`advance` and :meth:`reset_worlds`. The
     constructor resets all worlds.
@@ -105,7 +77,7 @@ class TableTennisEnv(EnvBase):
     ) -> None:
         if num_worlds < 1:
             raise ConfigError(f"num_worlds must be at least 1, got {num_worlds}")
-        check_policy(config.observation, config.predictor)
+        check_policy(config)
         check_critic(config.observation.critic)
         worlds = worlds or Worlds(config, num_worlds, device)
         super().__init__(device=worlds.device, batch_size=(num_worlds,))
@@ -136,12 +108,16 @@ class TableTennisEnv(EnvBase):
         self._forecast_return = ball.forecaster(struck, reward.target_x)
         self._forecast_serve = ball.forecaster(ball, reward.target_x)
         self.rewards = RewardManager(reward, self.num_worlds, device, worlds.control_dt)
-        signals = (self.sensing, worlds.kinematics, worlds.nominal, self.task_state.action)
-        self.actor = ActorSignals(*signals, predictor, config.predictor, self.game.rules, config.observation)
+        paddle = PaddleChain(worlds.model, worlds.spec.paddle)
+        self.actor = ActorSignals(config, self.sensing, self.task_state.action, paddle, predictor)
 
     def _allocate(self) -> None:
         names, count, device = self.config.observation, self.num_worlds, self.worlds.device
-        self.policy_layout, self.critic_layout = layout(names.policy, POLICY), layout(names.critic, CRITIC)
+        joints = len(self.worlds.spec.joints)
+        self.policy_layout, self.critic_layout = (
+            layout(names.policy, POLICY, joints),
+            layout(names.critic, CRITIC, joints),
+        )
         policy = [partial(POLICY[name].function, self.actor) for name in names.policy]
         critic = [partial(CRITIC[name].function, self.task_state) for name in names.critic]
         self._policy_history = History(names.policy_history, policy)
@@ -181,7 +157,7 @@ class TableTennisEnv(EnvBase):
 
     @torch.no_grad()
     def advance(self, action: Tensor) -> None:
-        """One control step with ``action`` (N, 21), clipped to +- ``robot.action_clip``.
+        """One control step with ``action`` (N, J), clipped to +- ``robot.action_clip``.
 
         Order: (1) the action becomes joint targets; robot and ball move through the step, with the action's and the
         sensors' delays inside it. (2) The referee consumes the ball's events in the order of their times; balls that
@@ -203,9 +179,8 @@ class TableTennisEnv(EnvBase):
         self.game.count_serves()
         self._start_serves(next_serve)
         self.sensing.update(self.worlds.robot, self.worlds.ball.position, next_serve)
-        self.actor.track.update(self.sensing.ball_position, next_serve)
-        self._compute_signals()
-        self.actor.remember()
+        self.actor.step(next_serve)
+        self._compute_truth()
         self._policy_history.push()
         self._critic_history.push()
         self._flag_bad()
@@ -228,9 +203,8 @@ class TableTennisEnv(EnvBase):
         for action in (self.task_state.action, self.task_state.previous_action):
             action.masked_fill_(mask.unsqueeze(-1), 0.0)
         self.sensing.reset(mask, self.worlds.robot, self.worlds.ball.position)
-        self.actor.track.restart(mask, self.sensing.ball_position)
-        self._compute_signals(mask)
-        self.actor.forget(mask)
+        self.actor.begin(mask)
+        self._compute_truth()
         self._policy_history.fill(mask)
         self._critic_history.fill(mask)
 
@@ -253,10 +227,9 @@ class TableTennisEnv(EnvBase):
         self._forecast_serve(mask)
         self.game.start_serve(mask)
 
-    def _compute_signals(self, changed: Tensor | None = None) -> None:
-        """What both networks see, and what the predictor is taught, from the current state."""
+    def _compute_truth(self) -> None:
+        """What the critic sees and the predictor is taught, from the current state."""
         self.task_state.derive()
-        self.actor.compute(changed)
         target, now = self.game.target, self.game.clock.time
         torch.sub(target.apex_time, now, out=self.predictor_time_to_apex)
         truth = {"apex": target.apex, "target": target.point, "target_time": (target.time - now).unsqueeze(-1)}
@@ -302,20 +275,15 @@ class TableTennisEnv(EnvBase):
             "game": self.game,
             "state": self.task_state,
             "sensing": self.sensing,
+            "policy": self._policy_history,
+            "critic": self._critic_history,
             "rewards": self.rewards,
             "statistics": self.statistics,
         }
 
     def _own_state(self) -> dict[str, Tensor]:
-        """What belongs to no part that declares its state."""
-        actor = self.actor
-        kept = {name: getattr(actor, name) for name in ("memory", "delay", "attitude", "joints", "track")}
-        kept |= {"actor": actor, "policy": self._policy_history, "critic": self._critic_history}
-        state = with_prefix("env", tensors_named(self, OWN_TENSORS))
-        for name, part in kept.items():
-            if part is not None:
-                state |= with_prefix(name, tensors_named(part, ONBOARD_STATE[name]))
-        return state
+        """Of the environment itself, and what the robot computes on board, whose names the estimates give."""
+        return with_prefix("env", tensors_named(self, OWN_TENSORS)) | self.actor.computed()
 
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:  # type: ignore[override]
         """Everything that the next step depends on, as copies: tensors by name, and ``generator``.

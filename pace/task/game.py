@@ -13,7 +13,8 @@ from torch import Tensor
 from pace.arrays.launch import Launch, MaskedLaunch
 from pace.arrays.state import Stateful
 from pace.arrays.tensors import allocate, named_tensors
-from pace.config.task import RewardConfig, ServeConfig, TaskConfig
+from pace.config.task import ServeConfig, TaskConfig
+from pace.onboard.prediction import idle_point
 from pace.task import game_kernels
 from pace.task.game_kernels import Rules
 from pace.task.game_state import GameState
@@ -23,12 +24,6 @@ if TYPE_CHECKING:
     from pace.sim.ball.ball import BallSim
 
 __all__ = ["Game", "Outcome"]
-
-
-def idle_point(config: RewardConfig) -> list[float]:
-    """Target of the paddle (m, world frame) that belongs to the idle base position."""
-    idle_xy = [base - arm for base, arm in zip(config.idle_base_xy, config.arm_offset, strict=True)]
-    return [*idle_xy, config.idle_height]
 
 
 def rules_of(config: TaskConfig) -> Rules:
@@ -43,7 +38,6 @@ def rules_of(config: TaskConfig) -> Rules:
     rules.arm_offset, rules.idle_base, rules.idle_point = reward.arm_offset, reward.idle_base_xy, idle_point(reward)
     for name in ("past_x", "low_z", "falling_x"):
         setattr(rules, name, reward.nothing_to_hit[name])
-    rules.moved = config.sensing.moved
     return rules
 
 

@@ -16,8 +16,6 @@ DOUBLE_HIT = wp.constant(int(Outcome.DOUBLE_HIT))
 VOLLEY = wp.constant(int(Outcome.VOLLEY))
 FALL = wp.constant(int(Outcome.FALL))
 BAD_SERVE = wp.constant(int(Outcome.BAD_SERVE))
-#: Times further ahead than this are as good as none, s.
-LONGEST_TIME = wp.constant(2.0)
 
 
 @wp.struct
@@ -40,7 +38,6 @@ class Rules:
     past_x: float
     low_z: float
     falling_x: float
-    moved: float  # what a sensed ball must have moved to have turned
 
 
 @wp.func

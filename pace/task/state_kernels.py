@@ -2,9 +2,10 @@
 
 import warp as wp
 
+from pace.onboard.prediction import LONGEST_TIME
 from pace.sim.ball.state import BallArrays
 from pace.sim.robot_state import RobotArrays
-from pace.task.game_kernels import LONGEST_TIME, Rules, something_to_hit_now
+from pace.task.game_kernels import Rules, something_to_hit_now
 from pace.task.game_state import GameArrays
 from pace.task.measures import DerivedArrays, MeasureArrays
 

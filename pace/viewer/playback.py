@@ -16,12 +16,12 @@ from torch import Tensor
 
 from pace.config.overrides import ON_A_CPU, override_task, without_reward
 from pace.config.task import TaskConfig
+from pace.onboard.actor import Predictor
 from pace.rl.policies import TaskPolicy
 from pace.sim.ball.ball import BallParams, BallSim
 from pace.sim.render import Ball, Line, Mark
 from pace.task.env import TableTennisEnv
 from pace.task.game import Outcome
-from pace.task.observations import Predictor
 from pace.task.resets import ServeSampler
 
 Array = NDArray[np.float64]

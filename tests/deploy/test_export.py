@@ -23,26 +23,13 @@ from pace.config.training import TrainConfig, load_train_config
 from pace.deploy import export
 from pace.deploy.__main__ import main
 from pace.deploy.export import ExportError, RawReadings, compare, export_policy, open_session, training_versions
-from pace.deploy.graph import (
-    INPUTS,
-    OUTPUTS,
-    BallTracks,
-    DeployedPolicy,
-    PaddleChain,
-    base_rotation,
-    input_ports,
-    input_shapes,
-    output_ports,
-)
+from pace.deploy.graph import DeployedPolicy, StateLayout, input_ports, output_ports, readings, results, state_parts
 from pace.predictor.network import PredictorNetwork
 from pace.rl.agent import Policy
 from pace.rl.policies import TaskPolicy, built_in_policy, load_policy, policy_size
 from pace.sim.ball.ball import BallParams, BallSim, ball_preset
-from pace.sim.kinematics import Kinematics
 from pace.sim.robot import build_model
-from pace.task.game import rules_of
-from pace.task.observations import BallTrack
-from tests.helpers.robot import JOINT_NAMES, SPEC
+from tests.helpers.robot import JOINT_NAMES
 from tests.helpers.saved import make_agent, make_config, remembering_policy, save_run
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "deploy_sim2sim.py"
@@ -99,8 +86,8 @@ def test_it_computes_what_the_task_computes(exported: tuple[Path, dict[str, floa
     assert list(differences) == names
     assert max(differences.values()) < 1e-5
     session = open_session(file)
-    assert [port.name for port in session.get_inputs()] == list(INPUTS)
-    assert [port.name for port in session.get_outputs()] == list(OUTPUTS)
+    assert [port.name for port in session.get_inputs()] == [*readings(21), "state"]
+    assert [port.name for port in session.get_outputs()] == [*results(21), "state_next"]
     assert stored(file)["check"]["largest_difference"] == differences
     assert list(file.parent.glob(".export_*")) == []
 
@@ -121,9 +108,12 @@ def test_the_metadata_is_what_a_robot_needs(exported: tuple[Path, dict[str, floa
     assert meta["actuator_delay"] == [0.0, 0.006]
     assert meta["config"]["reward"]["scale"] == 0.125  # of the run, not of configs/
     assert meta["observation"]["history"] * meta["observation"]["frame"]["something_to_hit"][1] == policy_size(config)
-    assert meta["inputs"]["ball_position"]["shape"] == [9, 3]
-    assert {name: tuple(port["shape"]) for name, port in meta["inputs"].items()} == input_shapes(config)
-    assert meta["kept"] == {"previous_action": "action", "ball_moved_away": "ball_moved_away_next"}
+    assert {name: port["size"] for name, port in meta["inputs"].items()} == {
+        name: port.size for name, port in input_ports(config).items()
+    }
+    assert list(meta["state"]) == ["started", "action", "turned", "track", "history"]
+    assert meta["state"]["track"]["columns"] == [23, 23 + 15]
+    assert meta["state"]["history"]["columns"][1] == meta["inputs"]["state"]["size"] == 23 + 15 + 4 * 90
     assert meta["counters"]["updates"] == 3
     assert meta["source"].startswith(str(run))
     assert len(meta["git"]["commit"]) == 40
@@ -157,6 +147,7 @@ class TorchSession:
 
     def __init__(self, policy: TaskPolicy) -> None:
         self.graph, self.names = DeployedPolicy(policy, make_model(policy.config)), input_ports(policy.config)
+        self.memory = StateLayout(policy.config).columns.get("memory")
 
     @torch.no_grad()
     def run(self, _: None, inputs: dict[str, np.ndarray]) -> list[np.ndarray]:
@@ -181,7 +172,9 @@ class Forgetful(TorchSession):
     """The graph of a caller who does not keep the memory."""
 
     def run(self, _: None, inputs: dict[str, np.ndarray]) -> list[np.ndarray]:
-        return super().run(None, inputs | {"return_memory": np.zeros_like(inputs["return_memory"])})
+        state = inputs["state"].copy()
+        state[:, self.memory] = 0.0
+        return super().run(None, inputs | {"state": state})
 
 
 class Watched:
@@ -189,28 +182,28 @@ class Watched:
 
     def __init__(self, file: Path) -> None:
         self.session, self.seen = open_session(file), np.zeros((4, 5))
+        self.columns = slice(*stored(file)["state"]["memory.last_return"]["columns"])
 
     def run(self, names: None, inputs: dict[str, np.ndarray]) -> list[np.ndarray]:
-        self.seen = np.maximum(self.seen, np.abs(inputs["return_memory"][:, 0, -5:]))
+        self.seen = np.maximum(self.seen, np.abs(inputs["state"][:, self.columns]))
         return self.session.run(names, inputs)
 
 
 def test_a_policy_that_remembers_its_returns(remembering: tuple[Path, TaskPolicy, dict[str, float]]) -> None:
     file, policy, differences = remembering
     assert max(differences.values()) < 1e-4
-    assert list(differences)[-4:] == ["return_memory_next", "delay_estimate_next", "attitude_next", "joints_next"]
+    assert sorted(list(differences)[-4:]) == ["attitude", "delay", "joints", "memory"]
     session, meta = open_session(file), stored(file)
-    inputs = [port.name for port in session.get_inputs()]
-    kept = ["return_memory", "delay_estimate", "attitude", "joints"]
-    assert inputs == list(input_ports(policy.config)) == [*INPUTS, *kept]
+    assert [port.name for port in session.get_inputs()] == list(input_ports(policy.config)) == [*readings(21), "state"]
     assert [port.name for port in session.get_outputs()] == list(output_ports(policy.config))
-    assert meta["inputs"]["return_memory"]["shape"] == [5, 24]
-    assert meta["inputs"]["delay_estimate"]["shape"] == [5, 8]
-    assert meta["kept"]["return_memory"] == "return_memory_next"
-    assert meta["kept"]["delay_estimate"] == "delay_estimate_next"
-    assert meta["inputs"]["joints"]["shape"] == [5, 43]
-    assert meta["kept"]["attitude"] == "attitude_next"
-    assert meta["kept"]["joints"] == "joints_next"
+    columns = StateLayout(policy.config).columns
+    sizes = {name: columns[name].stop - columns[name].start for name in ("memory", "delay", "attitude", "joints")}
+    assert sizes == {"memory": 24, "delay": 8, "attitude": 9, "joints": 43}
+    ends = [part["columns"] for part in meta["state"].values()]
+    assert ends[0] == [0, 1]
+    assert all(before[1] == after[0] for before, after in pairwise(ends))  # in order, without a gap
+    assert ends[-1][1] == meta["inputs"]["state"]["size"] == meta["outputs"]["state_next"]["size"]
+    assert meta["state"]["delay.delay"]["unit"] == "s"
 
 
 def test_the_filter_of_the_whole_flight_is_exported_for_any_number_of_robots(tmp_path: Path) -> None:
@@ -232,7 +225,7 @@ def test_memory_and_one_frame_of_history() -> None:
     policy = fresh_policy(["observation=memory", "observation.policy_history=1"])
     assert max(compare(TorchSession(policy), policy, options("check_steps=60")).values()) < 1e-5
     unused = fresh_policy(["observation=memory", "observation.policy=[base_position]"])
-    assert list(input_ports(unused.config)) == list(INPUTS)
+    assert "memory" not in StateLayout(unused.config).columns
     assert max(compare(TorchSession(unused), unused, options("check_steps=5")).values()) < 1e-5
 
 
@@ -269,49 +262,7 @@ def test_bad_input_is_one_line(
         DeployedPolicy(built_in_policy("zero", 1), make_model(make_config()))
 
 
-def test_paddle_and_base_as_the_kernels_have_them() -> None:
-    torch.manual_seed(2)
-    model, count = make_model(make_config()), 50
-    position, joints = torch.randn(count, 3), torch.randn(count, 21)
-    quat = torch.nn.functional.normalize(torch.randn(count, 4), dim=1)
-    quat[:, 1:3] *= 0.4  # heading and gravity describe all but a base that lies on its nose
-    quat = torch.nn.functional.normalize(quat, dim=1)
-    matrix = np.zeros((count, 9))
-    for row, q in zip(matrix, quat.double().numpy(), strict=True):
-        mujoco.mju_quat2Mat(row, q)
-    truth = torch.from_numpy(matrix).float().view(count, 3, 3)
-    rotation = base_rotation(-truth[:, 2], truth[:, :2, 0])
-    assert torch.allclose(rotation, truth, atol=1e-5)
-    centre, normal = PaddleChain(model)(position, rotation, joints)
-    expected = Kinematics(model, SPEC.tips, count, 1, "cpu").paddle_pose(position, quat, joints)
-    assert torch.allclose(centre, expected[0], atol=1e-5)
-    assert torch.allclose(normal, expected[1], atol=1e-5)
-
-
-def test_the_ball_is_followed_as_in_the_task() -> None:
-    torch.manual_seed(3)
-    config, worlds = make_config(), 64
-    track = BallTrack(config.predictor.frames, rules_of(config), worlds, torch.device("cpu"))
-    graph, frames = BallTracks(config), config.predictor.frames
-    length = frames + config.observation.policy_history - 1
-    sensed = torch.tensor([0.0, 0.0, 1.0]).repeat(worlds, 1)
-    track.restart(torch.ones(worlds, dtype=torch.bool), sensed)
-    positions, launched = sensed.unsqueeze(1).repeat(1, length, 1), torch.zeros(worlds, length, 1)
-    bit, seen = torch.zeros(worlds, 1), 0
-    for _ in range(60):
-        new = torch.rand(worlds) < 0.05
-        sensed += torch.tensor([-0.05, 0.0, 0.0]) + 0.06 * torch.randn(worlds, 3)
-        sensed[new] = torch.tensor([0.0, 0.0, 1.1])
-        track.update(sensed, new)
-        positions = torch.cat((positions[:, 1:], sensed.unsqueeze(1)), dim=1)
-        launched = torch.cat((launched[:, 1:], new.float().view(-1, 1, 1)), dim=1)
-        tracks, hittable, turned = graph(positions, launched, bit.unsqueeze(1))
-        bit = turned[:, :1].float()
-        assert torch.equal(turned[:, -1], track.turned)
-        assert torch.equal(tracks[:, -1], track.positions)
-        assert torch.equal(hittable[:, -1], track.something_to_hit)
-        seen += int(track.something_to_hit.sum())
-    assert 0.2 < seen / (60 * worlds) < 0.8  # both answers were asked for
+ROBOTS_OWN = set(readings(21)) - {"ball_launched"}
 
 
 def follow(controller: Any, policy: TaskPolicy) -> int:
@@ -319,10 +270,10 @@ def follow(controller: Any, policy: TaskPolicy) -> int:
     env = policy.make_env(1, "cpu", 4, ["sensing.base_shift=0.0", "engine.threads=1", "serve.serves_per_episode=0"])
     new_ball, restarts, serves = False, 0, 0
     for _ in range(200):
-        frame = {name: value[0].numpy() for name, value in RawReadings(env, policy.config).read().items()}
+        frame = {name: value[0] for name, value in RawReadings(env, policy.config).numpy().items()}
         action = policy(env.policy_observation)
         expected = env.worlds.nominal + 0.25 * action[0]
-        found = controller({name: value for name, value in frame.items() if name != "previous_action"}, new_ball)
+        found = controller({name: value for name, value in frame.items() if name in ROBOTS_OWN}, new_ball)
         assert np.abs(found - expected.numpy()).max() < 1e-5
         assert np.abs(controller.outputs["predicted_apex"] - env.actor.apex[0].numpy()).max() < 1e-5
         env.advance(action)
@@ -344,7 +295,8 @@ def test_the_example_remembers_its_returns(
 ) -> None:
     controller = example.Controller(remembering[0])
     assert follow(controller, remembering[1]) > 0
-    assert np.abs(controller.outputs["return_memory_next"][-5:]).min() > 0.0
+    columns = slice(*controller.meta["state"]["memory.last_return"]["columns"])
+    assert np.abs(controller.outputs["state_next"][columns]).min() > 0.0
 
 
 def test_the_example_refuses_files_of_other_versions(
@@ -355,7 +307,7 @@ def test_the_example_refuses_files_of_other_versions(
     model = onnx.load(str(exported[0]))
     onnx.helper.set_model_props(model, {"format": "1"})
     onnx.save(model, str(tmp_path / "old.onnx"))
-    with pytest.raises(ValueError, match="format 1, not 2: export it again"):
+    with pytest.raises(ValueError, match="format 1, not 3: export it again"):
         example.Controller(tmp_path / "old.onnx")
 
 
@@ -445,5 +397,23 @@ def test_the_referee_of_the_example(example: Any) -> None:
 def test_a_shorter_history_of_the_policy_keeps_the_balls() -> None:
     config = make_config()
     short = replace(config, observation=replace(config.observation, policy_history=2))
-    assert input_shapes(short)["ball_position"] == (6, 3)
-    assert input_shapes(short)["joint_position"] == (2, 21)
+    assert state_parts(short)["track"].size == 15
+    assert state_parts(short)["history"].size == 90
+
+
+def test_zeros_start_from_scratch_whatever_the_others_do() -> None:
+    """Of two robots in one call one may start while the other plays."""
+    policy = fresh_policy(["observation=memory"])
+    graph = DeployedPolicy(policy, make_model(policy.config))
+    torch.manual_seed(8)
+    ports = input_ports(policy.config)
+    first, second = ([torch.rand(2, port.size) for name, port in ports.items() if name != "state"] for _ in range(2))
+    with torch.no_grad():
+        played = graph(*first, torch.zeros(2, ports["state"].size))[-1]
+        state = played.clone()
+        state[1] = 0.0
+        mixed = graph(*second, state)
+        scratch, on = graph(*second, torch.zeros_like(state)), graph(*second, played)
+    for one, start, later in zip(mixed, scratch, on, strict=True):
+        torch.testing.assert_close(one, torch.stack((later[0], start[1])))
+    assert not torch.equal(scratch[-1], on[-1])

@@ -35,9 +35,7 @@ def take_the_gpus_way(env: TableTennisEnv) -> None:
 
     env.worlds.engine.model.opt.graph_conditional = False  # type: ignore[attr-defined]
     env.worlds.device = SimpleNamespace(type="cuda")  # type: ignore[assignment]
-    predict = env.actor._predict
-    of_some = on_gpu(predict, 1)
-    env.actor._predict = lambda *args: (predict if args[1] is None else of_some)(*args)  # type: ignore[method-assign]
+    env.actor.begin = on_gpu(env.actor.begin, 0)  # type: ignore[method-assign]
     for history in (env._policy_history, env._critic_history):
         history.fill = on_gpu(history.fill, 0)  # type: ignore[method-assign]
 

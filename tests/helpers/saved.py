@@ -16,6 +16,7 @@ from pace.rl.agent import Agent, Policy
 from pace.rl.policies import TaskPolicy, load_policy, policy_size
 from pace.runs.checkpoint import Checkpoint, save_checkpoint
 from pace.task.observations import POLICY, layout
+from tests.helpers.robot import SPEC
 
 OVERRIDES = ("algo.actor_hidden=[8]", "algo.critic_hidden=[8]", "algo.autocast=fp32", "reward.scale=0.125")
 
@@ -65,7 +66,7 @@ def remembering_policy(weight: float = 0.01) -> TaskPolicy:
     assert kept == old.config.observation.policy
     old_columns = torch.ones(policy_size(config) // history, dtype=torch.bool)
     for name in new:
-        old_columns[layout(frame, POLICY)[name]] = False
+        old_columns[layout(frame, POLICY, len(SPEC.joints))[name]] = False
     old_columns = old_columns.repeat(history)
     network = Policy.build(policy_size(config), 21, config.algo)
     weights = old.act.state_dict()

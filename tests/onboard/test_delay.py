@@ -13,9 +13,9 @@ from torch import Tensor
 from pace.config.base import ConfigError
 from pace.config.task import DelayEstimateConfig
 from pace.onboard.delay import DelayEstimate
-from pace.onboard.steps import DelayEstimateStep
 from pace.task.env import make_env
 from pace.task.observations import check_policy
+from tests.helpers.estimates import Running, check_observed_kept_and_begun, estimated
 from tests.helpers.fakes import config
 
 DT = 0.02
@@ -39,8 +39,7 @@ class Turning:
             heading=torch.zeros(count, 2),
         )
         self.look()
-        self.estimate = DelayEstimate(CONFIG, DT, self.sensing)  # type: ignore[arg-type]
-        self.estimate.restart(torch.ones(count, dtype=torch.bool))
+        self.estimate = Running(DelayEstimate(CONFIG, DT, 0), lambda: vars(self.sensing))
 
     def look(self) -> None:
         yaw = self.start + 0.6 * torch.sin(4.0 * (self.time - self.delays))
@@ -58,13 +57,13 @@ class Turning:
 
     @property
     def error(self) -> Tensor:
-        return self.estimate.seen.squeeze(1) + CONFIG.prior - self.delays
+        return self.estimate["delay"].squeeze(1) + CONFIG.prior - self.delays
 
 
 @pytest.mark.parametrize("start", [0.0, math.pi])  # also where the yaw jumps from pi to minus pi
 def test_turns_tell_the_delay(start: float) -> None:
     turning = Turning(torch.tensor([0.0, 0.004, 0.017, 0.03, 0.05]), start)
-    assert turning.estimate.seen.abs().max() == 0.0
+    assert turning.estimate["delay"].abs().max() == 0.0
     turning.run(400)
     assert turning.error.abs().max() < 1.5e-3  # of the first order in the delay
 
@@ -76,7 +75,7 @@ def test_the_prior_is_worth_what_it_says() -> None:
     without = float(turning.estimate.state[0, 5]) / squares
     expected = (squares * without + CONFIG.prior_worth * CONFIG.prior) / (squares + CONFIG.prior_worth)
     assert 1.0 < squares < 50.0
-    assert float(turning.estimate.seen) + CONFIG.prior == pytest.approx(expected, abs=1e-6)
+    assert float(turning.estimate["delay"]) + CONFIG.prior == pytest.approx(expected, abs=1e-6)
 
 
 def test_one_world_begins_anew() -> None:
@@ -90,23 +89,6 @@ def test_one_world_begins_anew() -> None:
     assert turning.error.abs().max() < 1.5e-3
 
 
-def test_the_exported_step_is_the_kernels() -> None:
-    torch.manual_seed(4)
-    turning = Turning(torch.linspace(0.0, 0.05, 64), start=2.8)
-    graph, state = DelayEstimateStep(CONFIG, DT), torch.zeros(64, 8)
-    sensing = turning.sensing
-    state = graph(state, sensing.base_angular_velocity, sensing.projected_gravity, sensing.heading)
-    for _ in range(50):
-        turning.time += DT
-        turning.look()
-        for signal in vars(sensing).values():
-            signal.add_(0.05 * torch.randn_like(signal))
-        turning.estimate.update()
-        state = graph(state, sensing.base_angular_velocity, sensing.projected_gravity, sensing.heading)
-        assert torch.allclose(state, turning.estimate.state, rtol=1e-4, atol=1e-4)
-    assert turning.estimate.seen.abs().min() > 0.0
-
-
 def test_a_simulated_robot_finds_its_delay() -> None:
     """Robots that swing at the waist: the estimate follows the simulation's delay, which it never sees."""
     settings = ["observation=memory", "sensing=wide", *NO_NOISE, "engine.threads=1", "engine.physics_dt=0.002"]
@@ -117,33 +99,29 @@ def test_a_simulated_robot_finds_its_delay() -> None:
         action = torch.zeros(32, 21)
         action[:, waist] = 4.0 * math.sin(2.0 * math.pi * step / 20)
         env.advance(action)
-    assert env.actor.delay is not None
     prior = env.config.observation.delay_estimate.prior  # type: ignore[union-attr]
-    estimate = env.actor.delay.seen.squeeze(1) + prior
+    estimate = estimated(env, "delay", "delay").squeeze(1) + prior
     assert torch.corrcoef(torch.stack((estimate, delay)))[0, 1] > 0.95
     assert float((estimate - delay).abs().mean()) < 0.004
     shown = env.policy_observation.view(32, 5, -1)[:, -1, env.policy_layout["sensed_delay"]]
-    assert torch.equal(shown, env.actor.delay.seen)
+    assert torch.equal(shown, estimated(env, "delay", "delay"))
     assert torch.equal(env.critic_observation[:, env.critic_layout["mocap_delay"]].squeeze(1), env.sensing.delay)
 
 
 def test_it_is_part_of_the_state_and_of_the_episode() -> None:
+    check_observed_kept_and_begun("delay")
     env = make_env(2, "native", "cpu", overrides=["observation=memory", "engine.threads=1"])
-    assert env.actor.delay is not None
     for _ in range(5):
         env.advance(torch.zeros(2, 21))
-    saved, kept = env.state_dict(), env.actor.delay.state.clone()
+    assert estimated(env, "delay", "delay").abs().min() > 0.0
     env.reset_worlds(torch.tensor([True, False]))
-    assert env.actor.delay.seen[0] == 0.0
-    assert torch.equal(env.actor.delay.state[1], kept[1])
-    env.load_state_dict(saved)
-    assert torch.equal(env.actor.delay.state, kept)
+    assert estimated(env, "delay", "delay")[0] == 0.0
 
 
 def test_wrong_numbers_are_refused() -> None:
     task = config("observation=memory")
     with pytest.raises(ConfigError, match=r"give observation\.delay_estimate"):
-        check_policy(replace(task.observation, delay_estimate=None), task.predictor)
+        check_policy(replace(task, observation=replace(task.observation, delay_estimate=None)))
     with pytest.raises(ConfigError, match=r"delay_estimate.smoothing must lie in"):
         config("observation=memory", "observation.delay_estimate.smoothing=nan")
     with pytest.raises(ConfigError, match=r"delay_estimate.prior must not be negative"):

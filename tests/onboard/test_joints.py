@@ -14,10 +14,9 @@ from scipy.linalg import solve_discrete_are
 from pace.config.base import ConfigError
 from pace.config.task import JointEstimateConfig
 from pace.onboard.joints import JointEstimate, steady_gain
-from pace.onboard.steps import JointEstimateStep
 from pace.task.env import make_env
 from pace.task.observations import check_policy
-from tests.helpers.estimates import check_observed_kept_and_begun
+from tests.helpers.estimates import Running, check_observed_kept_and_begun, estimated
 from tests.helpers.fakes import config
 
 DT = 0.02
@@ -33,8 +32,7 @@ class Shaking:
         self.position, self.velocity = torch.zeros(count, 3), torch.zeros(count, 3)
         self.sensing = SimpleNamespace(joint_position=torch.zeros(count, 3), joint_velocity=torch.zeros(count, 3))
         self.look()
-        self.estimate = JointEstimate(NUMBERS, DT, self.sensing)  # type: ignore[arg-type]
-        self.estimate.restart(torch.ones(count, dtype=torch.bool))
+        self.estimate = Running(JointEstimate(NUMBERS, DT, 3), lambda: vars(self.sensing))
 
     def normal(self, size: float) -> torch.Tensor:
         return size * torch.randn(self.position.shape, generator=self.generator)
@@ -68,7 +66,7 @@ def test_noise_is_reduced_to_what_the_theory_says() -> None:
         shaking.step()
         shaking.estimate.update()
         if step >= 50:
-            off = (shaking.estimate.position - shaking.position, shaking.estimate.velocity - shaking.velocity)
+            off = (shaking.estimate["position"] - shaking.position, shaking.estimate["velocity"] - shaking.velocity)
             squares.append(torch.stack([part.square().mean() for part in off]))
     error = torch.stack(squares).mean(0).sqrt()
     after = (np.eye(2) - steady_gain(NUMBERS, DT)) @ covariance()
@@ -85,8 +83,8 @@ def test_a_steady_motion_is_followed_without_lag() -> None:
     for _ in range(50):
         shaking.step()
         shaking.estimate.update()
-        torch.testing.assert_close(shaking.estimate.position, shaking.position, atol=1e-5, rtol=0.0)
-        torch.testing.assert_close(shaking.estimate.velocity, shaking.velocity, atol=1e-4, rtol=0.0)
+        torch.testing.assert_close(shaking.estimate["position"], shaking.position, atol=1e-5, rtol=0.0)
+        torch.testing.assert_close(shaking.estimate["velocity"], shaking.velocity, atol=1e-4, rtol=0.0)
 
 
 def test_one_world_begins_anew_with_what_is_sensed() -> None:
@@ -99,53 +97,34 @@ def test_one_world_begins_anew_with_what_is_sensed() -> None:
     shaking.step()
     shaking.estimate.restart(torch.tensor([True, False]))
     assert torch.equal(shaking.estimate.state[1], before[1])
-    assert torch.equal(shaking.estimate.position[0], shaking.sensing.joint_position[0])
-    assert torch.equal(shaking.estimate.velocity[0], shaking.sensing.joint_velocity[0])
-
-
-def test_the_exported_step_is_the_kernels() -> None:
-    shaking = Shaking(64)
-    graph, state = JointEstimateStep(NUMBERS, DT), torch.zeros(64, 7)
-    readings = (shaking.sensing.joint_position, shaking.sensing.joint_velocity)
-    state = graph(state, *readings)
-    torch.testing.assert_close(state, shaking.estimate.state, atol=1e-6, rtol=0.0)
-    for _ in range(60):
-        shaking.step()
-        shaking.estimate.update()
-        state = graph(state, *readings)
-        torch.testing.assert_close(state, shaking.estimate.state, atol=1e-4, rtol=0.0)  # rad/s; the gain is 24 1/s
+    assert torch.equal(shaking.estimate["position"][0], shaking.sensing.joint_position[0])
+    assert torch.equal(shaking.estimate["velocity"][0], shaking.sensing.joint_velocity[0])
 
 
 def test_the_task_knows_its_joints_better() -> None:
     env = make_env(64, "native", "cpu", overrides=["observation=memory", "engine.threads=1"])
-    assert env.actor.joints is not None
-    assert env.actor.attitude is not None
-    joints, robot, sensing = env.actor.joints, env.worlds.robot, env.sensing
+    robot, sensing = env.worlds.robot, env.sensing
+    position, velocity = (estimated(env, "joints", part) for part in ("position", "velocity"))
     for _ in range(30):
         env.advance(torch.zeros(64, 21))
-    moving = [
-        (given - robot.joint_velocity).square().mean().sqrt() for given in (joints.velocity, sensing.joint_velocity)
-    ]
+    moving = [(given - robot.joint_velocity).square().mean().sqrt() for given in (velocity, sensing.joint_velocity)]
     assert moving[0] < 0.6 * moving[1]
     true = robot.joint_position - env.worlds.nominal
-    at = [(given - true).square().mean().sqrt() for given in (joints.position, sensing.joint_position)]
+    at = [(given - true).square().mean().sqrt() for given in (position, sensing.joint_position)]
     assert at[0] < 0.95 * at[1]
-    given = env.worlds.kinematics.paddle_pose(
-        sensing.base_position, env.actor.attitude.quat, joints.position + env.worlds.nominal
-    )
+    down, ahead = (estimated(env, "attitude", part) for part in ("gravity", "heading"))
+    given = env.actor.onboard.paddle(sensing.base_position, down, ahead, position + env.worlds.nominal)
     torch.testing.assert_close(env.actor.paddle_position, given[0], atol=1e-5, rtol=0.0)
 
 
 def test_they_are_observed_kept_and_begin_with_the_episode() -> None:
-    check_observed_kept_and_begun(
-        "joints", {"estimated_joint_position": "position", "estimated_joint_velocity": "velocity"}
-    )
+    check_observed_kept_and_begun("joints")
 
 
 def test_wrong_numbers_are_refused() -> None:
     task = config("observation=memory")
     with pytest.raises(ConfigError, match=r"'estimated_joint_position': give observation\.joint_estimate"):
-        check_policy(replace(task.observation, joint_estimate=None), task.predictor)
+        check_policy(replace(task, observation=replace(task.observation, joint_estimate=None)))
     for name in ("acceleration", "position_noise", "velocity_noise"):
         for value in ("0", "-1", "nan", "inf"):
             with pytest.raises(ConfigError, match=rf"joint_estimate\.{name} must be positive and finite"):

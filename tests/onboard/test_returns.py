@@ -10,11 +10,11 @@ from torch import Tensor
 
 from pace.config.base import ConfigError
 from pace.config.task import ReturnMemoryConfig
-from pace.onboard.returns import SEEN, ReturnMemory
-from pace.onboard.steps import ReturnMemoryStep
+from pace.onboard.returns import ReturnMemory
 from pace.sim.ball.aero import GRAVITY
 from pace.task.env import make_env
 from pace.task.observations import check_policy
+from tests.helpers.estimates import Running, estimated
 from tests.helpers.fakes import config
 
 DT = 0.02
@@ -31,7 +31,15 @@ class Rally:
     def __init__(self) -> None:
         self.track, self.turned = torch.zeros(1, 15), torch.zeros(1, dtype=torch.bool)
         self.paddle, self.normal = torch.zeros(1, 3), NORMAL.repeat(1, 1)
-        self.memory = ReturnMemory(CONFIG, DT, self.track, self.turned, self.paddle, self.normal)
+        self.memory = Running(
+            ReturnMemory(CONFIG, DT, 0),
+            lambda: {
+                "track": self.track,
+                "turned": self.turned,
+                "paddle_position": self.paddle,
+                "paddle_normal": self.normal,
+            },
+        )
 
     def hit(self, restitution: float, paddle: Tensor = PADDLE, away: Tensor | None = None, last: int = 10) -> Tensor:
         """Play a ball that is hit one step before it is seen to turn, up to instant ``last``; its velocity after it."""
@@ -58,19 +66,19 @@ class Rally:
 
     @property
     def estimate(self) -> float:
-        return float(self.memory.seen[0, 3]) + PRIOR
+        return float(self.memory["last_return"][0, 3]) + PRIOR
 
 
 @pytest.mark.parametrize("restitution", [0.38, 0.65, 0.87])
 def test_one_hit_moves_the_prior_by_its_weight(restitution: float) -> None:
     rally = Rally()
-    assert rally.memory.seen.abs().max() == 0.0
+    assert rally.memory["last_return"].abs().max() == 0.0
     after = rally.hit(restitution)
     assert rally.estimate == pytest.approx((PRIOR * PRIOR_HITS + restitution) / (PRIOR_HITS + 1.0), abs=1e-3)
     # seen in the middle of the two steps that begin one step after the hit
     expected = after - torch.tensor([0.0, 0.0, 2.0 * DT * GRAVITY])
-    assert torch.allclose(rally.memory.seen[0, :3], expected, atol=2e-3)
-    assert float(rally.memory.seen[0, 4]) == pytest.approx(1.0 / CONFIG.hits)
+    assert torch.allclose(rally.memory["last_return"][0, :3], expected, atol=2e-3)
+    assert float(rally.memory["last_return"][0, 4]) == pytest.approx(1.0 / CONFIG.hits)
 
 
 def test_many_hits_come_to_the_truth_and_old_ones_fade() -> None:
@@ -80,30 +88,30 @@ def test_many_hits_come_to_the_truth_and_old_ones_fade() -> None:
             rally.next_ball()
             rally.hit(restitution)
         assert rally.estimate == pytest.approx(restitution, abs=0.03)
-    assert float(rally.memory.seen[0, 4]) == pytest.approx(1.0)
+    assert float(rally.memory["last_return"][0, 4]) == pytest.approx(1.0)
 
 
 def test_what_is_no_hit_of_the_paddle_teaches_nothing() -> None:
     rally = Rally()
     rally.hit(0.8, away=POINT - torch.tensor([0.6, 0.0, 0.0]))  # turned by the net, say
-    assert rally.memory.seen.abs().max() == 0.0
+    assert rally.memory["last_return"].abs().max() == 0.0
     rally.next_ball()
     moving_with_it = BALL + torch.tensor([1.0, 0.0, 0.0])
     rally.hit(0.8, paddle=moving_with_it)  # too slow to tell a restitution; where the ball went is seen
-    assert float(rally.memory.seen[0, 3]) == 0.0
-    assert rally.memory.seen[0, :3].abs().max() > 1.0
+    assert float(rally.memory["last_return"][0, 3]) == 0.0
+    assert rally.memory["last_return"][0, :3].abs().max() > 1.0
 
 
 def test_a_new_ball_before_the_return_was_seen_leaves_the_memory_as_it_was() -> None:
     rally = Rally()
     rally.hit(0.8)
-    before = rally.memory.seen.clone()
+    before = rally.memory["last_return"].clone()
     for last in (6, 7):  # seen to turn, one step after that; in the next its velocity would have been seen
         rally.next_ball()
         rally.hit(0.4, last=last)
         for _ in range(3):
             rally.next_ball()
-        assert torch.equal(rally.memory.seen, before)
+        assert torch.equal(rally.memory["last_return"], before)
 
 
 def test_it_can_be_forgotten_world_by_world() -> None:
@@ -115,44 +123,20 @@ def test_it_can_be_forgotten_world_by_world() -> None:
     assert rally.memory.state.abs().max() == 0.0
 
 
-def test_the_exported_memory_is_the_kernels() -> None:
-    torch.manual_seed(6)
-    worlds, teaching = 512, 0
-    track, turned = torch.zeros(worlds, 18), torch.zeros(worlds, dtype=torch.bool)  # one frame more than it needs
-    paddle, normal = torch.zeros(worlds, 3), torch.zeros(worlds, 3)
-    memory = ReturnMemory(CONFIG, DT, track, turned, paddle, normal)
-    graph, state = ReturnMemoryStep(CONFIG, DT), torch.zeros(worlds, 24)
-    for _ in range(60):
-        # balls at some 5 m/s, within reach of the paddle and not, turned for a few steps and then new
-        paddle.copy_(POINT + 0.05 * torch.randn(worlds, 3))
-        track.copy_((POINT + 0.2 * torch.randn(worlds, 6, 3)).flatten(1))
-        normal.copy_(torch.nn.functional.normalize(NORMAL + 0.5 * torch.randn(worlds, 3), dim=1))
-        turned.copy_(torch.where(turned, torch.rand(worlds) < 0.8, torch.rand(worlds) < 0.5))
-        before = memory.seen.clone()
-        memory.update()
-        state = graph(state, track, turned.unsqueeze(1), paddle, normal)
-        assert torch.allclose(state, memory.state, rtol=1e-5, atol=1e-4)
-        teaching += int((memory.seen[:, 3] != before[:, 3]).sum())
-        of_paddle = memory.state[:, 0] == 1.0
-        assert of_paddle.any()
-        assert (turned & ~of_paddle).any()
-    assert 1000 < teaching < 0.2 * 60 * worlds
-
-
 def test_the_actor_remembers_over_serves_and_forgets_with_the_episode() -> None:
     env = make_env(2, "native", "cpu", overrides=["observation=memory", "engine.threads=1"])
-    assert env.actor.memory is not None
-    env.actor.memory.state[:, -SEEN:] = 0.25
+    seen = estimated(env, "memory", "last_return")
+    seen.fill_(0.25)
     columns = env.policy_layout["last_return"]
     for _ in range(5):
         env.advance(torch.zeros(2, 21))
     frame = env.policy_observation.view(2, 5, -1)[:, -1, columns]
-    assert torch.equal(frame, torch.full((2, SEEN), 0.25))
+    assert torch.equal(frame, torch.full((2, 5), 0.25))
     saved = env.state_dict()
     env.reset_worlds(torch.tensor([True, False]))
-    assert env.policy_observation.view(2, 5, -1)[:, -1, columns].tolist() == [[0.0] * SEEN, [0.25] * SEEN]
+    assert env.policy_observation.view(2, 5, -1)[:, -1, columns].tolist() == [[0.0] * 5, [0.25] * 5]
     env.load_state_dict(saved)
-    assert torch.equal(env.actor.memory.seen, torch.full((2, SEEN), 0.25))
+    assert torch.equal(seen, torch.full((2, 5), 0.25))
 
 
 def test_the_critic_sees_the_contact_that_the_ball_has() -> None:
@@ -165,10 +149,10 @@ def test_the_critic_sees_the_contact_that_the_ball_has() -> None:
 def test_it_needs_its_numbers_and_five_frames() -> None:
     task = config("observation=memory")
     with pytest.raises(ConfigError, match="observation=memory"):
-        check_policy(replace(task.observation, return_memory=None), task.predictor)
+        check_policy(replace(task, observation=replace(task.observation, return_memory=None)))
     task = config("observation=memory", "predictor.frames=4")
     with pytest.raises(ConfigError, match=r"predictor.frames of 5 or more, got 4"):
-        check_policy(task.observation, task.predictor)
+        check_policy(task)
     with pytest.raises(ConfigError, match=r"return_memory.prior must lie in"):
         config("observation=memory", "observation.return_memory.prior=nan")
     with pytest.raises(ConfigError, match=r"return_memory.reach must be positive"):

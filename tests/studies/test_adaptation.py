@@ -11,7 +11,7 @@ import torch
 from pace.evaluation.serves import wilson
 from pace.studies import adaptation
 from pace.studies.adaptation import SERVES, Adaptation, Forgetful
-from pace.task.observations import POLICY, layout
+from pace.task.observations import POLICY, layout, width
 from tests.helpers.fakes import config
 from tests.helpers.saved import save_run
 
@@ -47,11 +47,11 @@ def test_a_blanked_memory_is_that_before_the_first_return_in_every_frame() -> No
             return observation
 
     frames = task.observation.policy_history
-    size = sum(POLICY[name].size for name in task.observation.policy)
+    size = sum(width(POLICY[name].size, 21) for name in task.observation.policy)
     observation = torch.rand(3, frames * size) + 1.0
     kept = observation.clone()
     Forgetful(Policy())(observation)  # type: ignore[arg-type]
-    columns = layout(task.observation.policy, POLICY)["last_return"]
+    columns = layout(task.observation.policy, POLICY, 21)["last_return"]
     changed = (seen[0] != observation).view(3, frames, size)
     assert bool(changed[..., columns].all())
     assert int(changed.sum()) == 3 * frames * 5

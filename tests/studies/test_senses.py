@@ -11,14 +11,13 @@ import torch
 from pace.config.base import ConfigError
 from pace.studies import senses
 from pace.task.env import make_env
+from tests.helpers.estimates import estimated
 from tests.helpers.saved import save_run
 
 
 def test_errors_are_those_of_the_truth() -> None:
     env = make_env(32, "native", "cpu", overrides=["observation=memory", "sensing=clean", "engine.threads=1"])
-    assert env.actor.delay is not None
-    assert env.actor.attitude is not None
-    env.actor.delay.seen.fill_(0.005)
+    estimated(env, "delay", "delay").fill_(0.005)
     found = dict(zip(range(11), senses.errors(env), strict=True))
     assert found[0].mean() == pytest.approx(1e3 * (0.017 + 0.005), rel=1e-4)  # without delay all of it is an error
     for column in range(1, 11):
@@ -28,6 +27,7 @@ def test_errors_are_those_of_the_truth() -> None:
     env.sensing.joint_position -= 0.01
     env.sensing.heading.copy_(env.worlds.robot.heading.flip(1) * torch.tensor([-1.0, 1.0]))  # a quarter turn
     assert senses.errors(env)[3].abs().mean() == pytest.approx(1e3 * math.pi / 2, rel=1e-4)
+    env.sensing.heading.copy_(env.worlds.robot.heading)
     env.sensing.base_position[:, 0] += 0.01
     assert senses.errors(env)[9].norm(dim=1).mean() == pytest.approx(10.0, rel=1e-2)
     assert senses.errors(env)[10].abs().max() < 0.05

@@ -14,20 +14,18 @@ from pace.config.task import PredictorConfig, TaskConfig
 from pace.predictor.network import predictor_slices
 from pace.sim.sensing import Sensing
 from pace.task.env import TableTennisEnv
-from pace.task.game import rules_of
+from pace.task.history import History
 from pace.task.observations import (
     CRITIC,
     POLICY,
-    ActorSignals,
-    BallTrack,
-    History,
     check_critic,
     check_policy,
     layout,
+    width,
 )
+from pace.task.signals import ActorSignals
 from tests.helpers.fakes import CPU, config, fake_state, fake_worlds
 
-RULES = rules_of(config())
 NO = torch.zeros(1, dtype=torch.bool)
 YES = torch.ones(1, dtype=torch.bool)
 IDLE = torch.tensor([-1.7, -0.3, 1.0])
@@ -39,26 +37,26 @@ IDLE = torch.tensor([-1.7, -0.3, 1.0])
 )
 def test_sizes(overrides: tuple[str, ...], policy: int, critic: int) -> None:
     names = config(*overrides).observation
-    assert sum(POLICY[name].size for name in names.policy) == policy
-    assert sum(CRITIC[name].size for name in names.critic) == critic
+    assert sum(width(POLICY[name].size, 21) for name in names.policy) == policy
+    assert sum(width(CRITIC[name].size, 21) for name in names.critic) == critic
 
 
 def test_layout_follows_the_order_of_the_names() -> None:
-    columns = layout(["heading", "base_position", "joint_velocity"], POLICY)
+    columns = layout(["heading", "base_position", "joint_velocity"], POLICY, 21)
     assert columns == {"heading": slice(0, 2), "base_position": slice(2, 5), "joint_velocity": slice(5, 26)}
 
 
 @pytest.mark.parametrize("name", ["ball_velocity", "apex", "paddle_touched", "base_linear_velocity"])
 def test_privileged_names_are_refused_for_the_actor(name: str) -> None:
     with pytest.raises(ConfigError, match=f"unknown name '{name}' .privileged"):
-        check_policy(replace(config().observation, policy=["heading", name]), config().predictor)
+        check_policy(replace(config(), observation=replace(config().observation, policy=["heading", name])))
 
 
 def test_unknown_names_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"observation.critic: unknown name 'ball_colour'"):
         check_critic(["ball_colour"])
     with pytest.raises(ConfigError, match=r"add 'target_time' to predictor.outputs"):
-        check_policy(config("observation=paddle_pose").observation, config("predictor=paper").predictor)
+        check_policy(config("observation=paddle_pose", "predictor=paper"))
     with pytest.raises(ConfigError, match=r"predictor.outputs"):
         predictor_slices(["apex", "spin"])
     with pytest.raises(ConfigError, match=r"predictor.outputs"):
@@ -83,54 +81,9 @@ def test_history_is_oldest_first_and_filled_at_reset() -> None:
     assert history.observation.tolist() == expected
 
 
-def test_ball_track_is_oldest_first_and_restarts_with_a_new_ball() -> None:
-    track = BallTrack(5, RULES, 1, CPU)
-    track.restart(YES, torch.tensor([[1.3, 0.0, 1.0]]))
-    assert track.positions[0, 0::3].tolist() == pytest.approx([1.3] * 5)
-    for x in (1.2, 1.1, 1.0):
-        track.update(torch.tensor([[x, 0.0, 1.0]]), NO)
-    assert track.positions[0, 0::3].tolist() == pytest.approx([1.3, 1.3, 1.2, 1.1, 1.0])
-    track.update(torch.tensor([[1.35, 0.0, 1.0]]), YES)
-    assert track.positions[0, 0::3].tolist() == pytest.approx([1.35] * 5)
-
-
-@pytest.mark.parametrize(
-    ("path", "expected"),
-    [
-        ([(1.0, 1.0), (0.9, 1.0), (0.8, 1.0)], True),
-        ([(-1.8, 1.0), (-1.85, 1.0), (-1.91, 1.0)], False),  # past the robot
-        ([(-1.0, 0.75), (-1.1, 0.72), (-1.2, 0.69)], False),  # too low
-        ([(-1.5, 1.0), (-1.55, 0.99), (-1.6, 0.97)], False),  # behind the table and falling
-        ([(-1.5, 1.0), (-1.55, 1.01), (-1.6, 1.02)], True),
-        ([(-1.5, 1.0), (-1.4, 1.0), (-1.3, 1.0)], False),  # goes away
-    ],
-)
-def test_something_to_hit_as_far_as_the_robot_can_know(path: list[tuple[float, float]], expected: bool) -> None:
-    track = BallTrack(5, RULES, 1, CPU)
-    for i, (x, z) in enumerate(path):
-        track.update(torch.tensor([[x, 0.0, z]]), YES if i == 0 else NO)
-    assert bool(track.something_to_hit) is expected
-
-
-def test_noise_turns_no_ball_that_is_seen_late() -> None:
-    """Motion capture that is more than a control step late sees a new ball where it was launched twice."""
-    track = BallTrack(5, RULES, 1, CPU)
-    for i, x in enumerate((1.350, 1.378, 1.25, 1.12)):  # twice the paper's noise: +-14 mm
-        track.update(torch.tensor([[x, 0.0, 1.0]]), YES if i == 0 else NO)
-        assert bool(track.something_to_hit)
-    for x in (-1.40, -1.43, -1.365):  # hit between the second and the third: 3.5 cm away again
-        track.update(torch.tensor([[x, 0.0, 1.0]]), NO)
-    assert bool(track.turned)
-
-
-def test_a_ball_that_turned_away_stays_gone_until_the_next_one() -> None:
-    track = BallTrack(5, RULES, 1, CPU)
-    for x in (-1.5, -1.4, -1.3, -1.35, -1.4, -1.45):  # comes back from the net
-        track.update(torch.tensor([[x, 0.0, 1.0]]), NO)
-    assert bool(track.turned)
-    assert not bool(track.something_to_hit)
-    track.update(torch.tensor([[1.35, 0.0, 1.0]]), YES)
-    assert bool(track.something_to_hit)
+def fake_paddle(base_position: Tensor, *_: Tensor) -> tuple[Tensor, Tensor]:
+    """A paddle that is always half a metre in front of the base and 0.3 m above it."""
+    return base_position + torch.tensor([0.5, 0.0, 0.3]), torch.tensor([1.0, 0.0, 0.0]).expand_as(base_position)
 
 
 def fake_actor(task: TaskConfig, output: Tensor | None) -> ActorSignals:
@@ -145,10 +98,10 @@ def fake_actor(task: TaskConfig, output: Tensor | None) -> ActorSignals:
 
     predictor = predict if output is not None else None
     action = torch.zeros(1, 21)
-    kinematics = worlds.kinematics
-    actor = ActorSignals(sensing, kinematics, worlds.nominal, action, predictor, task.predictor, rules_of(task))
+    actor = ActorSignals(task, sensing, action, fake_paddle, predictor)
     for x in (0.7, 0.6, 0.5):
-        actor.track.update(torch.tensor([[x, 0.0, 1.1]]), torch.tensor([x == 0.7]))
+        sensing.ball_position.copy_(torch.tensor([[x, 0.0, 1.1]]))
+        actor.step(torch.tensor([x == 0.7]))
     return actor
 
 
@@ -157,7 +110,6 @@ PREDICTION = torch.tensor([[-1.4, 0.1, 1.1, -1.6, 0.12, 1.05, 0.3]])
 
 def test_predicted_quantities() -> None:
     actor = fake_actor(config("sensing=clean"), PREDICTION)
-    actor.compute()
     torch.testing.assert_close(actor.apex, PREDICTION[:, :3])
     torch.testing.assert_close(actor.target, PREDICTION[:, 3:6])
     assert float(actor.time) == pytest.approx(0.3)
@@ -170,7 +122,6 @@ def test_predicted_quantities() -> None:
 def test_shift_of_the_paper_uses_the_apex_and_a_clamped_target() -> None:
     task = config("sensing=clean", "reward=paper", "predictor=paper", "observation=paper")
     actor = fake_actor(task, PREDICTION[:, :3])
-    actor.compute()
     torch.testing.assert_close(actor.shift, torch.tensor([[0.3, 0.4]]))
     torch.testing.assert_close(actor.target, torch.tensor([[-1.6, 0.1, 1.1]]))
     assert float(actor.time) == 0.0
@@ -178,8 +129,8 @@ def test_shift_of_the_paper_uses_the_apex_and_a_clamped_target() -> None:
 
 def test_predictions_are_masked_while_nothing_is_to_hit() -> None:
     actor = fake_actor(config("sensing=clean"), PREDICTION)
-    actor.track.update(torch.tensor([[0.9, 0.0, 1.1]]), NO)  # turned away
-    actor.compute()
+    actor.sensing.ball_position.copy_(torch.tensor([[0.9, 0.0, 1.1]]))  # turned away
+    actor.step(NO)
     torch.testing.assert_close(actor.apex[0], IDLE)
     torch.testing.assert_close(actor.target[0], IDLE)
     assert float(actor.time) == 0.0
@@ -190,7 +141,6 @@ def test_predictions_are_masked_while_nothing_is_to_hit() -> None:
 def test_without_a_predictor_its_quantities_are_zero() -> None:
     for task, output in ((config(), None), (config("predictor.enabled=false"), PREDICTION)):
         actor = fake_actor(task, output)
-        actor.compute()
         for tensor in (actor.apex, actor.target, actor.time, actor.shift):
             assert not tensor.any()
 
@@ -254,8 +204,8 @@ def policy_input(env: TableTennisEnv, change: Any = None) -> tuple[Tensor, Tenso
         change(env)
     no_new_ball = torch.zeros(8, dtype=torch.bool)
     env.sensing.update(env.worlds.robot, env.worlds.ball.position, no_new_ball)
-    env.actor.track.update(env.sensing.ball_position, no_new_ball)
-    env._compute_signals()
+    env.actor.step(no_new_ball)
+    env._compute_truth()
     env._policy_history.push()
     frame, positions = env.policy_observation.clone(), env.predictor_input.clone()
     env.load_state_dict(state)

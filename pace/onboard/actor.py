@@ -1,0 +1,164 @@
+"""One control step of all that a robot computes between its readings and the network of its policy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from pace.config.task import TaskConfig
+from pace.onboard.ball_track import BallTrack, Track
+from pace.onboard.estimate import Estimate
+from pace.onboard.estimates import ESTIMATES, make_estimates
+from pace.onboard.prediction import Prediction, PredictionReader, no_prediction
+from pace.sim.robot import nominal_pose
+
+Predictor = Callable[[Tensor], Tensor]
+#: Base position (N, 3) m, gravity (N, 3), heading (N, 2), joints (N, J) rad -> centre (N, 3) m and normal (N, 3).
+PaddlePose = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
+#: Name of an estimate and the signals that it reads, by name -> its new state (N, S).
+Advance = Callable[[str, dict[str, Tensor]], Tensor]
+
+
+class Readings(NamedTuple):
+    """One frame of the sensors, as those of :class:`pace.sim.sensing.Sensing`: ``base_angular_velocity`` (N, 3) rad/s
+    and ``projected_gravity`` (N, 3), body frame; ``base_position``, ``ball_position`` (N, 3) m and ``heading`` (N, 2),
+    world frame; ``joint_position`` (N, J) rad relative to the nominal pose, ``joint_velocity`` (N, J) rad/s."""
+
+    base_angular_velocity: Tensor
+    base_position: Tensor
+    projected_gravity: Tensor
+    heading: Tensor
+    joint_position: Tensor
+    joint_velocity: Tensor
+    ball_position: Tensor
+
+
+@dataclass
+class Signals:
+    """All that the actor may see.
+
+    Attributes: ``sensing``, the readings; ``action`` (N, J) the previous action; ``track`` of the ball; ``prediction``
+    (N, P) raw output; ``apex``, ``target`` (N, 3) m predicted, ``time`` (N,) s until the ball is at the target,
+    ``shift`` (N, 2) m from the sensed base to where it should stand; ``paddle_position`` (N, 3) m, ``paddle_normal``
+    (N, 3); ``estimates``, the state (N, S) of each estimate by name.
+    """
+
+    sensing: Readings
+    action: Tensor
+    track: Track
+    prediction: Tensor
+    apex: Tensor
+    target: Tensor
+    time: Tensor
+    shift: Tensor
+    paddle_position: Tensor
+    paddle_normal: Tensor
+    estimates: dict[str, Tensor]
+
+    def computed(self) -> dict[str, Tensor]:
+        """All but readings and action, by the names under which checkpoints have them."""
+        names = ("prediction", "apex", "target", "time", "shift", "paddle_position", "paddle_normal")
+        track = {f"track.{name}": value for name, value in self.track._asdict().items()}
+        own = {f"actor.{name}": getattr(self, name) for name in names}
+        return track | own | {f"{name}.state": state for name, state in self.estimates.items()}
+
+
+class Onboard(nn.Module):
+    """The steps in their order: the ball's track; the estimates that the paddle's pose is computed from; that pose; the
+    prediction; the other estimates.
+
+    While there is nothing to hit the prediction is replaced by the point to stand by. Without a predictor (ablation)
+    the predicted quantities are zero.
+
+    Args:
+        config: the task.
+        paddle: forward kinematics of the paddle (:class:`pace.onboard.kinematics.PaddleChain`).
+        predictor: callable (N, 3 * frames) -> (N, P), or ``None``.
+
+    Errors: :class:`pace.config.ConfigError` for an estimate without its numbers.
+    """
+
+    nominal: Tensor
+
+    def __init__(self, config: TaskConfig, paddle: PaddlePose, predictor: Predictor | None) -> None:
+        super().__init__()
+        nominal = torch.tensor(nominal_pose(config.robot), dtype=torch.float32)
+        self.register_buffer("nominal", nominal, persistent=False)
+        self.track, self.reader = BallTrack(config), PredictionReader(config)
+        self.estimates = nn.ModuleDict(make_estimates(config, len(nominal)))
+        self.paddle = paddle
+        self.predictor = predictor if config.predictor.enabled else None
+
+    def estimate(self, name: str) -> Estimate:
+        """An estimate of the policy's."""
+        found = self.estimates[name]
+        assert isinstance(found, Estimate)
+        return found
+
+    def begin(self, sensing: Readings, action: Tensor) -> Signals:
+        """The first step of an episode, with a new ball."""
+        track = self.track.begin(sensing.ball_position)
+        return self._complete(sensing, action, track, lambda name, reads: self.estimate(name).begin(**reads))
+
+    def forward(
+        self,
+        sensing: Readings,
+        action: Tensor,
+        track: Track,
+        estimates: Mapping[str, Tensor],
+        new_ball: Tensor,
+        started: Tensor | None = None,
+    ) -> Signals:
+        """One control step later.
+
+        Args: sensing: the readings; action (N, J) that was done; track, estimates: those of :class:`Signals` of the
+        step before; new_ball (N,) bool: balls just launched; started (N,) bool: the others begin as in :meth:`begin`,
+        whatever the step before says of them; ``None``: all have.
+        """
+        new_ball = new_ball if started is None else new_ball | ~started
+        track = self.track(track.positions, track.turned, sensing.ball_position, new_ball)
+
+        def advance(name: str, reads: dict[str, Tensor]) -> Tensor:
+            later = self.estimate(name)(estimates[name], **reads)
+            if started is None:
+                return later
+            return torch.where(started.unsqueeze(1), later, self.estimate(name).begin(**reads))
+
+        return self._complete(sensing, action, track, advance)
+
+    def _complete(self, sensing: Readings, action: Tensor, track: Track, advance: Advance) -> Signals:
+        """Everything that follows from readings, ball's track and the estimates' states before."""
+        known = {**sensing._asdict(), "action": action, "track": track.positions}
+        known |= {"turned": track.turned, "something_to_hit": track.something_to_hit}
+        states = self._advance(known, advance, for_the_pose=True)
+        paddle = self._paddle_pose(sensing, states)
+        output, prediction = self._predict(track, sensing.base_position)
+        known |= {"paddle_position": paddle[0], "paddle_normal": paddle[1], **prediction._asdict()}
+        states |= self._advance(known, advance, for_the_pose=False)
+        return Signals(sensing, action, track, output, *prediction, *paddle, states)
+
+    def _advance(self, known: Mapping[str, Tensor], advance: Advance, for_the_pose: bool) -> dict[str, Tensor]:
+        """New states of the estimates that the paddle's pose is computed from, or of the others."""
+        entries = {name: ESTIMATES[name] for name in self.estimates}
+        chosen = {name: entry for name, entry in entries.items() if bool(entry.replaces) == for_the_pose}
+        return {name: advance(name, {read: known[read] for read in entry.reads}) for name, entry in chosen.items()}
+
+    def _paddle_pose(self, sensing: Readings, states: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """From the estimates' states, and from what is sensed if they have no say."""
+        seen = sensing._asdict()
+        for name, state in states.items():
+            columns = self.estimate(name).columns
+            seen |= {reading: state[:, columns[part]] for reading, part in ESTIMATES[name].replaces.items()}
+        joints = seen["joint_position"] + self.nominal
+        return self.paddle(seen["base_position"], seen["projected_gravity"], seen["heading"], joints)
+
+    def _predict(self, track: Track, base_position: Tensor) -> tuple[Tensor, Prediction]:
+        if self.predictor is None:
+            nothing = torch.zeros_like(base_position[:, :1]).expand(-1, self.reader.size)
+            return nothing, no_prediction(base_position)
+        output = self.predictor(track.positions)
+        return output, self.reader(output, track.something_to_hit, base_position)

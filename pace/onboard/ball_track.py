@@ -1,0 +1,71 @@
+"""The last sensed positions of the current ball, and what they say about it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from pace.config.base import ConfigError
+from pace.config.task import TaskConfig
+
+
+class Track(NamedTuple):
+    """A ball as its robot has followed it.
+
+    ``positions`` (N, 3 * frames) m, oldest first, the predictor's input (before a ball has been seen that often, its
+    first position is repeated); ``turned`` (N,) bool, the ball has been seen moving away since it was launched;
+    ``something_to_hit`` (N,) bool, as far as the robot can know.
+    """
+
+    positions: Tensor
+    turned: Tensor
+    something_to_hit: Tensor
+
+
+class BallTrack(nn.Module):
+    """Follows each robot's ball.
+
+    Args: config: ``predictor.frames``, ``sensing.moved`` and ``reward.nothing_to_hit``.
+    Errors: :class:`ConfigError` for fewer than three frames.
+    """
+
+    def __init__(self, config: TaskConfig) -> None:
+        super().__init__()
+        self.frames, self.moved = config.predictor.frames, config.sensing.moved
+        if self.frames < 3:
+            raise ConfigError(
+                f"predictor.frames must be at least 3, got {self.frames}: the ball's velocity is seen over 3"
+            )
+        rule = config.reward.nothing_to_hit
+        self.past_x, self.low_z, self.falling_x = rule["past_x"], rule["low_z"], rule["falling_x"]
+
+    def begin(self, sensed: Tensor) -> Track:
+        """The track of a new ball that is first sensed at (N, 3) m."""
+        positions = sensed.repeat(1, self.frames)
+        return self._judge(positions, torch.zeros_like(sensed[:, 0], dtype=torch.bool))
+
+    def forward(self, positions: Tensor, turned: Tensor, sensed: Tensor, new_ball: Tensor) -> Track:
+        """One control step later.
+
+        Args: positions (N, 3 * frames) m and turned (N,) bool of the step before; sensed (N, 3) m; new_ball (N,) bool
+        marks balls that were just launched.
+        """
+        return self._judge(self.append(positions, sensed, new_ball), turned & ~new_ball)
+
+    def append(self, positions: Tensor, sensed: Tensor, new_ball: Tensor) -> Tensor:
+        """The positions (N, 3 * frames) m alone, one control step later."""
+        longer = torch.cat((positions[:, 3:], sensed), dim=1)
+        return torch.where(new_ball.unsqueeze(1), sensed.repeat(1, self.frames), longer)
+
+    def _judge(self, positions: Tensor, turned: Tensor) -> Track:
+        # over two steps: noise matters less. A ball that is seen late stands still at first, but for the noise
+        change = positions[:, -3:] - positions[:, -9:-6]
+        gone = (change[:, 0] > self.moved) | turned
+        return Track(positions, gone, ~(gone | self._nothing_to_hit(positions[:, -3:], change)))
+
+    def _nothing_to_hit(self, position: Tensor, change: Tensor) -> Tensor:
+        """As for the referee (:func:`pace.task.game_kernels.nothing_to_hit`): past the robot, too low, falling."""
+        x, z = position[:, 0], position[:, 2]
+        return (x < self.past_x) | (z < self.low_z) | ((x < self.falling_x) & (change[:, 2] < 0.0))

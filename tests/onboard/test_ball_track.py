@@ -1,0 +1,106 @@
+"""The ball's track: what it holds, and what the robot can know of the ball from it."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+import warp as wp
+from torch import Tensor
+
+from pace.arrays.share import share
+from pace.config.base import ConfigError
+from pace.onboard.ball_track import BallTrack
+from pace.task.game import rules_of
+from pace.task.game_kernels import Rules, nothing_to_hit
+from tests.helpers.fakes import config
+
+NO = torch.zeros(1, dtype=torch.bool)
+YES = torch.ones(1, dtype=torch.bool)
+
+
+class Followed:
+    """One ball and its track, so far."""
+
+    def __init__(self, *sensed: float) -> None:
+        self.step = BallTrack(config())
+        self.track = self.step.begin(torch.tensor([sensed]))
+
+    def see(self, *sensed: float, new: Tensor = NO) -> None:
+        self.track = self.step(self.track.positions, self.track.turned, torch.tensor([sensed]), new)
+
+
+def test_it_is_oldest_first_and_restarts_with_a_new_ball() -> None:
+    ball = Followed(1.3, 0.0, 1.0)
+    assert ball.track.positions[0, 0::3].tolist() == pytest.approx([1.3] * 5)
+    for x in (1.2, 1.1, 1.0):
+        ball.see(x, 0.0, 1.0)
+    assert ball.track.positions[0, 0::3].tolist() == pytest.approx([1.3, 1.3, 1.2, 1.1, 1.0])
+    ball.see(1.35, 0.0, 1.0, new=YES)
+    assert ball.track.positions[0, 0::3].tolist() == pytest.approx([1.35] * 5)
+
+
+@pytest.mark.parametrize(
+    ("path", "expected"),
+    [
+        ([(1.0, 1.0), (0.9, 1.0), (0.8, 1.0)], True),
+        ([(-1.8, 1.0), (-1.85, 1.0), (-1.91, 1.0)], False),  # past the robot
+        ([(-1.0, 0.75), (-1.1, 0.72), (-1.2, 0.69)], False),  # too low
+        ([(-1.5, 1.0), (-1.55, 0.99), (-1.6, 0.97)], False),  # behind the table and falling
+        ([(-1.5, 1.0), (-1.55, 1.01), (-1.6, 1.02)], True),
+        ([(-1.5, 1.0), (-1.4, 1.0), (-1.3, 1.0)], False),  # goes away
+    ],
+)
+def test_something_to_hit_as_far_as_the_robot_can_know(path: list[tuple[float, float]], expected: bool) -> None:
+    ball = Followed(path[0][0], 0.0, path[0][1])
+    for x, z in path[1:]:
+        ball.see(x, 0.0, z)
+    assert bool(ball.track.something_to_hit) is expected
+
+
+def test_noise_turns_no_ball_that_is_seen_late() -> None:
+    """Motion capture that is more than a control step late sees a new ball where it was launched twice."""
+    ball = Followed(1.350, 0.0, 1.0)
+    assert bool(ball.track.something_to_hit)
+    for x in (1.378, 1.25, 1.12):  # twice the paper's noise: +-14 mm
+        ball.see(x, 0.0, 1.0)
+        assert bool(ball.track.something_to_hit)
+    for x in (-1.40, -1.43, -1.365):  # hit between the second and the third: 3.5 cm away again
+        ball.see(x, 0.0, 1.0)
+    assert bool(ball.track.turned)
+
+
+def test_a_ball_that_turned_away_stays_gone_until_the_next_one() -> None:
+    ball = Followed(-1.5, 0.0, 1.0)
+    for x in (-1.4, -1.3, -1.35, -1.4, -1.45):  # comes back from the net
+        ball.see(x, 0.0, 1.0)
+    assert bool(ball.track.turned)
+    assert not bool(ball.track.something_to_hit)
+    ball.see(1.35, 0.0, 1.0, new=YES)
+    assert not bool(ball.track.turned)
+    assert bool(ball.track.something_to_hit)
+
+
+@wp.kernel
+def _referees_rule(position: wp.array[wp.vec3], velocity: wp.array[wp.vec3], rules: Rules, found: wp.array[wp.bool]):
+    world = wp.tid()
+    found[world] = nothing_to_hit(position[world], velocity[world], rules)
+
+
+def test_the_rule_is_that_of_the_referee() -> None:
+    torch.manual_seed(3)
+    count, found = 2000, torch.zeros(2000, dtype=torch.bool)
+    positions = torch.tensor([-1.6, 0.0, 0.8]) + 0.4 * torch.randn(count, 3)
+    change = 0.1 * torch.randn(count, 3)
+    step = BallTrack(config("sensing.moved=0.0"))
+    track = torch.cat((positions - change, positions - 0.5 * change, positions), dim=1).repeat(1, 2)[:, 3:]
+    seen = step._judge(track, torch.zeros(count, dtype=torch.bool))
+    moved = (track[:, -3:] - track[:, -9:-6]).contiguous()
+    inputs = [share(positions), share(moved), rules_of(config()), share(found)]
+    wp.launch(_referees_rule, dim=count, inputs=inputs, device="cpu")
+    assert torch.equal(seen.something_to_hit, ~found)
+    assert 0.1 < float(found.float().mean()) < 0.9
+
+
+def test_too_few_frames_are_refused() -> None:
+    with pytest.raises(ConfigError, match=r"predictor\.frames must be at least 3, got 2"):
+        BallTrack(config("predictor.frames=2"))
