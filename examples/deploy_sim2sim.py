@@ -245,7 +245,9 @@ def disc_distance(offset: Vector, axis: Vector, radius: float, half_thickness: f
 
 def build_model(scene: Path, meta: Mapping[str, Any]) -> mujoco.MjModel:
     """The scene with the motors of the training: gains, effort and, where the file has it, the torque-speed line."""
-    spec = mujoco.MjSpec.from_file(str(scene))
+    robot = meta["config"]["robot"]["model"]  # in the folder of the scene, or a path
+    file = scene.parent / robot if (scene.parent / robot).exists() else Path(robot)
+    spec = mujoco.MjSpec.from_string(scene.read_text(), include={"robot.xml": file.read_bytes()})
     speeds, stalls = (meta.get(key) or [None] * len(meta["joint_names"]) for key in ("max_speed", "stall_torque"))
     motors = zip(meta["joint_names"], meta["kp"], meta["kd"], meta["effort"], speeds, stalls, strict=True)
     for name, kp, kd, effort, speed, stall in motors:
@@ -465,7 +467,7 @@ def main() -> int:
     parser.add_argument("--serve", choices=SERVES, default="mixed", help="serve range of the paper's evaluation")
     parser.add_argument("--noise", type=float, default=1.0, help="times the noise and delays of the training")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--scene", type=Path, default=SCENE, help="MJCF of robot and table")
+    parser.add_argument("--scene", type=Path, default=SCENE, help="MJCF of the table, beside that of the robot")
     options = parser.parse_args()
     if options.serves < 1 or options.noise < 0.0:
         parser.error("--serves must be at least 1, --noise not negative")

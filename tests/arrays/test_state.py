@@ -12,10 +12,11 @@ from pace.arrays.state import Stateful, tensors_named, under_prefix, with_prefix
 from pace.task.env import TableTennisEnv
 from tests.helpers.fakes import config
 
-#: Part -> its tensors, as checkpoints have them since commit 43400ac.
+#: Part -> its tensors, as checkpoints have them since commit 43400ac. Those had a few more, which are computed from
+#: these: actor._base_quat, actor._joints, actor._nominal, actor.action and attitude.quat.
 STATE = {
     "": "generator",
-    "actor": "_base_quat _joints _nominal action apex paddle_normal paddle_position prediction shift target time",
+    "actor": "apex paddle_normal paddle_position prediction shift target time",
     "critic": "frame observation",
     "env": "_bad predictor_target predictor_time_to_apex",
     "game.clock": "fresh index played time",
@@ -49,7 +50,7 @@ STATE = {
 }
 #: Those of what the robot works out over an episode, with ``observation=memory``.
 MEMORY = {
-    "attitude": "quat state",
+    "attitude": "state",
     "delay": "state",
     "joints": "state",
     "memory": "state",

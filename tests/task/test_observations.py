@@ -238,7 +238,7 @@ def privileged(env: TableTennisEnv) -> dict[str, Tensor]:
     found |= {"ball.velocity": ball.velocity, "ball.spin": ball.spin, "ball.near": ball.nearest_paddle_distance}
     for group in (ball.events, ball.forecast_result, ball.params, env.worlds.engine.params):
         found |= {f"{type(group).__name__}.{f.name}": getattr(group, f.name) for f in fields(group)}  # type: ignore[arg-type]
-    for name, part in vars(env.game).items():
+    for name, part in ((name, part) for name, part in vars(env.game).items() if hasattr(part, "__dict__")):
         found |= {f"game.{name}.{key}": value for key, value in _tensors(part).items() if key != "idle_point"}
     found |= {f"reward.{name}": value for name, value in _tensors(env.rewards).items()}
     for name in ("something_to_hit", "lost", "base_error", "foot_load", "foot_contact"):
