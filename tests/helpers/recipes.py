@@ -18,8 +18,9 @@ FOLDER = RESULTS / "recipe"
 
 @lru_cache
 def recipe(name: str) -> TrainConfig:
-    """A resolved recipe over the defaults, as ``+recipe=NAME`` composes it: its reward is its own, other keys that it does
-    not name (``seed``, ``device``, ...) are the defaults."""
+    """A resolved recipe over the defaults, as ``+recipe=NAME`` composes it.
+
+    Its reward is its own; other keys that it does not name (``seed``, ``device``, ...) are the defaults."""
     defaults = {key: value for key, value in to_dict(load_train_config()).items() if key != "reward"}
     merged = OmegaConf.merge(defaults, with_current_names(written(name)))
     return parse(OmegaConf.to_container(merged), TrainConfig)  # type: ignore[arg-type]
