@@ -8,8 +8,9 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from pace.config.base import compose, parse
-from pace.config.training import TrainConfig
+from pace.config.base import parse, to_dict
+from pace.config.renamed import with_current_names
+from pace.config.training import TrainConfig, load_train_config
 
 RESULTS = Path(__file__).resolve().parents[2] / "docs" / "results"
 FOLDER = RESULTS / "recipe"
@@ -17,8 +18,12 @@ FOLDER = RESULTS / "recipe"
 
 @lru_cache
 def recipe(name: str) -> TrainConfig:
-    """A resolved recipe as the command trains it; keys that its file does not hold are the defaults of today."""
-    return parse(compose("train", [f"+recipe={name}", f"hydra.searchpath=[{RESULTS}]"]), TrainConfig)
+    """A resolved recipe over the defaults, as ``+recipe=NAME`` composes it.
+
+    Its reward is its own; other keys that it does not name (``seed``, ``device``, ...) are the defaults."""
+    defaults = {key: value for key, value in to_dict(load_train_config()).items() if key != "reward"}
+    merged = OmegaConf.merge(defaults, with_current_names(written(name)))
+    return parse(OmegaConf.to_container(merged), TrainConfig)  # type: ignore[arg-type]
 
 
 def written(name: str) -> dict[str, Any]:

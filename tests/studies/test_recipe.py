@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from pace.config.base import to_dict
+from pace.config.base import compose, parse, to_dict
+from pace.config.training import TrainConfig
 from pace.rl.train import main as train
 from pace.runs.metrics import Milestone, passage, read_curve, read_metrics
 from pace.studies import learning_curves
@@ -49,8 +50,14 @@ def test_a_recipe_is_whole_and_of_this_version(name: str) -> None:
     run_keys = set(to_dict(config)) - set(written(name))
     assert run_keys == {
         "device", "processes", "seed", "out", "resume", "init_from", "predictor_from", "checkpoint_minutes",
-        "tensorboard", "progress",
+        "tensorboard", "progress", "plugins",
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["steps_12", "campaign_wide", "no_hit_guidance"])
+def test_a_recipe_can_be_composed_for_training(name: str) -> None:
+    composed = parse(compose("train", [f"+recipe={name}", f"hydra.searchpath=[{RESULTS}]"]), TrainConfig)
+    assert composed == recipe(name)
 
 
 def test_a_recipe_can_be_trained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
