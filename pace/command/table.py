@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from pace.config.overrides import CHANGEABLE
+from pace.config.overrides import TASK_GROUPS, TASK_VALUES
 
 #: Groups of the training, in the order of configs/train.yaml.
 TRAIN_GROUPS = (
@@ -69,7 +69,8 @@ COMMANDS = {
         ),
         positional=("run",),
         flags=("sweep",),
-        groups=CHANGEABLE,
+        groups=(*TASK_GROUPS, "engine"),
+        training_keys=TASK_VALUES,
         collected=True,
         refused={"serve": "rows= names the serve ranges, such as rows=[short]"},
     ),
@@ -87,7 +88,8 @@ COMMANDS = {
         ),
         positional=("run",),
         options=("video",),
-        groups=CHANGEABLE,
+        groups=(*TASK_GROUPS, "engine"),
+        training_keys=TASK_VALUES,
         collected=True,
     ),
     "export": Command(

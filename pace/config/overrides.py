@@ -20,7 +20,8 @@ TASK_GROUPS = ("ball", "serve", "reset", "randomization", "sensing", "reward", "
 
 
 #: Parts of a saved task of which single values may be changed.
-CHANGEABLE = (*TASK_GROUPS, "engine", "landing_target")
+TASK_VALUES = ("landing_target",)
+CHANGEABLE = (*TASK_GROUPS, "engine", *TASK_VALUES)
 
 
 #: Changes of a saved task that is played on a CPU, one world or a few, whatever it was trained on.
