@@ -43,7 +43,8 @@ def test_a_saved_configuration_gets_current_names() -> None:
         "curriculum": [{"samples": 1e6, "task": ["randomization=moderate", "serve.vx=[-6.0,-5.0]", "sensing=wide"]}],
     }
     assert saved["algo"] == {"name": "pace", "gamma": 0.9}
-    assert with_current_names({}) == {}
+    for odd in ({}, {"algo": 3, "curriculum": 7}, {"curriculum": [{"samples": 1e6}, None]}):
+        assert with_current_names(odd) == odd
 
 
 def test_a_policy_that_was_saved_with_old_names_has_the_new_ones() -> None:

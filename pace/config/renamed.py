@@ -38,11 +38,16 @@ def with_current_names(saved: Mapping[str, Any]) -> dict[str, Any]:
         part = config.get(group)
         if isinstance(part, Mapping) and isinstance(part.get("name"), str):
             config[group] = {**part, "name": renamed_choice(group, part["name"])}
-    if "curriculum" in config:
-        config["curriculum"] = [
-            {**stage, "task": [current_override(text) for text in stage["task"]]} for stage in config["curriculum"]
-        ]
+    if isinstance(config.get("curriculum"), list):
+        config["curriculum"] = [_current_stage(stage) for stage in config["curriculum"]]
     return config
+
+
+def _current_stage(stage: Any) -> Any:
+    """A stage of a curriculum; anything else stays as it is, for the check against the dataclasses to complain of."""
+    if not isinstance(stage, Mapping) or not isinstance(stage.get("task"), list):
+        return stage
+    return {**stage, "task": [current_override(text) if isinstance(text, str) else text for text in stage["task"]]}
 
 
 def current_override(text: str) -> str:

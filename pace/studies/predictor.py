@@ -28,17 +28,17 @@ SEED = 5
 WINDOWS = {"bound, five positions": 5, "bound, whole flight": FRAMES}
 #: Name -> ball preset, randomisation and sensing.
 CASES = {
-    "rubber": ("rubber", "full", "paper"),
-    "paper": ("paper", "full", "paper"),
-    "standard": ("standard", "full", "paper"),
-    "venue": ("venue", "full", "paper"),
+    "rubber": ("rubber", "moderate", "paper"),
+    "paper": ("paper", "moderate", "paper"),
+    "standard": ("standard", "moderate", "paper"),
+    "venue": ("venue", "moderate", "paper"),
     "all (wide)": ("rubber", "wide", "paper"),
     "paper, as published": ("paper", "paper", "paper"),
     "rubber, ball known": ("rubber", "none", "paper"),
-    "rubber, clean": ("rubber", "full", "clean"),
-    "paper, clean": ("paper", "full", "clean"),
-    "standard, clean": ("standard", "full", "clean"),
-    "venue, clean": ("venue", "full", "clean"),
+    "rubber, clean": ("rubber", "moderate", "clean"),
+    "paper, clean": ("paper", "moderate", "clean"),
+    "standard, clean": ("standard", "moderate", "clean"),
+    "venue, clean": ("venue", "moderate", "clean"),
     "rubber, ball known, clean": ("rubber", "none", "clean"),
 }
 DRAWN = ("rubber", "rubber, ball known")

@@ -18,8 +18,12 @@ FOLDER = RESULTS / "recipe"
 
 @lru_cache
 def recipe(name: str) -> TrainConfig:
-    """A resolved recipe; keys of a single run, such as ``seed`` and ``device``, are the defaults of today."""
-    return parse(to_dict(load_train_config()) | with_current_names(written(name)), TrainConfig)
+    """A resolved recipe over the defaults, as ``+recipe=NAME`` composes it.
+
+    Its reward is its own; other keys that it does not name (``seed``, ``device``, ...) are the defaults."""
+    defaults = {key: value for key, value in to_dict(load_train_config()).items() if key != "reward"}
+    merged = OmegaConf.merge(defaults, with_current_names(written(name)))
+    return parse(OmegaConf.to_container(merged), TrainConfig)  # type: ignore[arg-type]
 
 
 def written(name: str) -> dict[str, Any]:
