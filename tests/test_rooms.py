@@ -6,7 +6,6 @@ import ast
 from functools import lru_cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -74,10 +73,6 @@ def imports(module: str) -> frozenset[str]:
     return frozenset(name for name in found if name in modules())
 
 
-#: Files that break the rule until another part of issue 15 replaces them: each goes as soon as it keeps to it.
-KNOWN = {"pace.onboard.kernels"}  # takes a Warp struct of task.game_kernels; the torch modules on board need none
-
-
 def room(module: str) -> str:
     """Room of a module: the longest name of :data:`LEVEL` that it begins with; the package itself has none."""
     name = module.removeprefix("pace.")
@@ -95,12 +90,7 @@ def test_every_file_is_in_a_room() -> None:
     assert {module for module in modules() if module.endswith(".__main__")} <= commands() <= set(modules())
 
 
-def cases() -> list[Any]:
-    broken = pytest.mark.xfail(strict=True, reason="see KNOWN")
-    return [pytest.param(module, marks=[broken] if module in KNOWN else []) for module in files()]
-
-
-@pytest.mark.parametrize("module", cases())
+@pytest.mark.parametrize("module", files())
 def test_a_file_imports_from_its_own_room_or_from_below(module: str) -> None:
     own = room(module)
     others = [other for other in imports(module) if room(other) not in (own, "")]

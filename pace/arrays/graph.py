@@ -10,7 +10,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from pace.arrays.share import warp_stream
+from pace.arrays.streams import warp_stream
 from pace.config.base import ConfigError
 from pace.config.sim import EngineConfig
 

@@ -11,7 +11,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from pace.arrays.share import require_shape, torch_stream
+from pace.arrays.streams import torch_stream
 
 T = TypeVar("T")
 
@@ -175,3 +175,9 @@ def _as_array(where: str, declared: Any, tensor: Tensor, device: torch.device) -
     if inner and tensor.stride(-1) != 1:
         raise LaunchError(f"{where} must hold the numbers of each vector side by side")
     return wp.from_torch(tensor, dtype=element)
+
+
+def require_shape(name: str, tensor: Tensor, shape: tuple[int, ...]) -> None:
+    """Kernels read by index, beyond the end of a tensor that is too small. Errors: ``ValueError`` that names it."""
+    if tensor.shape != shape:
+        raise ValueError(f"{name} must have shape {shape}, not {tuple(tensor.shape)}")

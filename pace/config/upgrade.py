@@ -93,9 +93,8 @@ STATE_UPGRADES: list[Upgrade] = []
 def upgrade_config(config: Saved, version: int) -> Saved:
     """A saved configuration of the format ``version``, in the current format; ``config`` stays as it is."""
     changed = deepcopy(config)
-    if isinstance(changed, dict):  # anything else is left for the parser to complain about
-        for _, upgrade in _due(version, CONFIG_UPGRADES):
-            upgrade(changed)
+    for _, upgrade in _due(version, CONFIG_UPGRADES):
+        upgrade(changed)
     return changed
 
 

@@ -165,7 +165,9 @@ def read_meta(folder: Path) -> dict[str, Any]:
     missing = [key for key in ("config", "counters", "weights", "training") if key not in meta]
     if missing:
         raise CheckpointError(f"{file} lacks {', '.join(missing)}")
-    return meta | {"config": upgrade_config(meta["config"], meta["format"])}
+    if isinstance(meta["config"], dict):
+        meta["config"] = upgrade_config(meta["config"], meta["format"])
+    return meta
 
 
 def _read_tensors(file: Path) -> dict[str, Tensor]:

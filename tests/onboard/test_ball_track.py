@@ -7,7 +7,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from pace.arrays.share import share
+from pace.arrays.launch import Launch
 from pace.config.base import ConfigError
 from pace.onboard.ball_track import BallTrack
 from pace.task.game import rules_of
@@ -95,8 +95,8 @@ def test_the_rule_is_that_of_the_referee() -> None:
     track = torch.cat((positions - change, positions - 0.5 * change, positions), dim=1).repeat(1, 2)[:, 3:]
     seen = step._judge(track, torch.zeros(count, dtype=torch.bool))
     moved = (track[:, -3:] - track[:, -9:-6]).contiguous()
-    inputs = [share(positions), share(moved), rules_of(config()), share(found)]
-    wp.launch(_referees_rule, dim=count, inputs=inputs, device="cpu")
+    given = {"position": positions, "velocity": moved, "rules": rules_of(config()), "found": found}
+    Launch(_referees_rule, count, torch.device("cpu"), **given)()
     assert torch.equal(seen.something_to_hit, ~found)
     assert 0.1 < float(found.float().mean()) < 0.9
 

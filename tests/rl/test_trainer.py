@@ -282,7 +282,7 @@ def test_rates_of_the_statistics() -> None:
 def test_a_run_folder_has_one_owner(tmp_path: Path) -> None:
     first = RunFolder(tmp_path, {}, False)
     first.log({"update": 1.0, "samples": 4.0})
-    with pytest.raises(ConfigError, match="in use by another process: end that first, or give another run_dir"):
+    with pytest.raises(ConfigError, match="in use by another process: end that first, or give another out="):
         RunFolder(tmp_path, {}, False)
     first.log({"update": 2.0, "samples": 8.0})
     first.close()

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pace.arrays.graph import CapturedCall, RecordedLaunches, graphs_wanted
 from pace.arrays.launch import Launch
-from pace.arrays.share import warp_scope
+from pace.arrays.streams import warp_scope
 from pace.config.sim import EngineConfig
 from pace.sim.engine.base import StateTensors
 from pace.sim.engine.model_fields import ModelFields
