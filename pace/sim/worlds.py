@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
+from functools import partial
 
 import mujoco
 import torch
@@ -22,7 +23,7 @@ from pace.sim.kinematics import Kinematics
 from pace.sim.randomization import Randomizer
 from pace.sim.robot import build_model, nominal_pose
 from pace.sim.robot_spec import RobotSpec
-from pace.sim.robot_state import RobotState
+from pace.sim.robot_state import RobotArrays, RobotState
 
 
 @wp.kernel
@@ -32,9 +33,7 @@ def _derive(
     qvel: wp.array3d[float],
     last: int,
     inverse_dt: float,
-    gravity: wp.array2d[float],
-    heading: wp.array2d[float],
-    acceleration: wp.array2d[float],
+    robot: RobotArrays,
 ):
     """Gravity in the body frame, heading on the ground and mean joint acceleration of one masked world."""
     world = wp.tid()
@@ -44,17 +43,14 @@ def _derive(
     x = qpos[world, last, 4]
     y = qpos[world, last, 5]
     z = qpos[world, last, 6]
-    gravity[world, 0] = 2.0 * (w * y - x * z)
-    gravity[world, 1] = -2.0 * (y * z + w * x)
-    gravity[world, 2] = 2.0 * (x * x + y * y) - 1.0
+    robot.projected_gravity[world] = wp.vec3(2.0 * (w * y - x * z), -2.0 * (y * z + w * x), 2.0 * (x * x + y * y) - 1.0)
     forward = 1.0 - 2.0 * (y * y + z * z)
     left = 2.0 * (x * y + w * z)
     length = wp.max(wp.sqrt(forward * forward + left * left), 1.0e-6)
-    heading[world, 0] = forward / length
-    heading[world, 1] = left / length
-    for joint in range(acceleration.shape[1]):
+    robot.heading[world] = wp.vec2(forward / length, left / length)
+    for joint in range(robot.joint_acceleration.shape[1]):
         change = qvel[world, last, 6 + joint] - qvel[world, 0, 6 + joint]
-        acceleration[world, joint] = change * inverse_dt
+        robot.joint_acceleration[world, joint] = change * inverse_dt
 
 
 @wp.kernel
@@ -146,23 +142,19 @@ class Worlds(Stateful):
         self.nominal = torch.as_tensor(nominal_pose(self.config.robot), dtype=torch.float32, device=device)
         limits = torch.as_tensor(self.model.jnt_range[1:], dtype=torch.float32, device=device)
         self.joint_lower, self.joint_upper = limits[:, 0].contiguous(), limits[:, 1].contiguous()
-        self._gravity = torch.zeros(n, 3, device=device)
-        self._heading = torch.zeros(n, 2, device=device)
-        self._acceleration = torch.zeros(n, joints, device=device)
         self._previous_targets = self.nominal.repeat(n, 1)
         self._targets = torch.zeros(n, self.config.substeps, joints, device=device)
         self._new_share = torch.zeros(n, self.config.substeps, 1, device=device)
         self._applied = torch.zeros(n, self.model.nv, device=device)
         self._reaction, self._reaction_point = torch.zeros(n, 3, device=device), torch.zeros(n, 3, device=device)
-        self._record()
         self.robot = self._robot_state()
+        self._record()
         self._update_delay()
 
     def _record(self) -> None:
         n, device, qpos = self.num_worlds, self.device, self.engine.qpos_path
         path = {"qpos": qpos, "qvel": self.engine.qvel_path, "last": self.config.substeps}
-        derived = {"gravity": self._gravity, "heading": self._heading, "acceleration": self._acceleration}
-        self._derive = MaskedLaunch(_derive, n, device, inverse_dt=1.0 / self.control_dt, **path, **derived)
+        self._derive = MaskedLaunch(_derive, n, device, robot=self.robot, inverse_dt=1.0 / self.control_dt, **path)
         held = {"previous_targets": self._previous_targets, "impulse": self.ball.events.paddle_impulse}
         self._stand = MaskedLaunch(_stand, n, device, qpos=qpos, **held)
         delay, share = self.randomizer.actuator_delay, self._new_share.squeeze(-1)
@@ -177,17 +169,18 @@ class Worlds(Stateful):
     def _robot_state(self) -> RobotState:
         qpos, qvel = self.engine.qpos_path[:, -1], self.engine.qvel_path[:, -1]
         paddle = self.kinematics.paddle_path[:, -1]
+        zeros = partial(torch.zeros, self.num_worlds, device=self.device)
         return RobotState(
             joint_position=qpos[:, 7:],
             joint_velocity=qvel[:, 6:],
-            joint_acceleration=self._acceleration,
+            joint_acceleration=zeros(len(self.spec.joints)),
             joint_torque=self.engine.joint_torque,
             base_position=qpos[:, :3],
             base_quat=qpos[:, 3:7],
             base_linear_velocity=qvel[:, :3],
             base_angular_velocity=qvel[:, 3:6],
-            projected_gravity=self._gravity,
-            heading=self._heading,
+            projected_gravity=zeros(3),
+            heading=zeros(2),
             paddle_position=paddle[:, :3],
             paddle_normal=paddle[:, 3:6],
             paddle_velocity=paddle[:, 6:9],
