@@ -88,9 +88,7 @@ def run_name(experiment: str, seed: int) -> str:
 
 def train(config: AblateConfig, out: Path) -> Mapping[str, str]:
     """Play the runs and write their CSVs into ``out``; returns the reasons of those that failed."""
-    runs = planned_runs(config)
-    for run in runs:
-        check_settings(run)
+    runs = [check_settings(run) for run in planned_runs(config)]
     queue = RunQueue(runs, config.jobs, config.progress)
     try:
         queue.play()

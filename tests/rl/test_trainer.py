@@ -175,6 +175,16 @@ def test_a_run_changes_to_float32_when_its_spread_is_small_and_resumes_exactly(
     assert all(torch.equal(expected[name], found[name]) for name in expected)
 
 
+def test_a_checkpoint_of_before_there_were_other_algorithms_is_resumed(tmp_path: Path) -> None:
+    first, second = make_trainer(tmp_path / "first"), make_trainer(tmp_path / "second")
+    first.train()
+    old = first.checkpoint()
+    assert old.training is not None
+    old.training["ppo"] = old.training.pop("algorithm")
+    second.resume(old)
+    assert learner(second).ppo.actor_optimiser.state
+
+
 def test_rows_after_the_checkpoint_are_replaced_by_a_resume(tmp_path: Path) -> None:
     make_trainer(tmp_path, updates=2).train()
     with (tmp_path / "metrics.csv").open("a") as file:
