@@ -17,8 +17,9 @@ from pace.config.base import ConfigError, parse, to_dict
 from pace.config.training import SchedulePoint, TrainConfig, load_train_config
 from pace.predictor.network import PredictorNetwork
 from pace.rl.ppo import AsymmetricPPO
+from pace.rl.rates import summarise
 from pace.rl.rollout import Rollout, RolloutError
-from pace.rl.trainer import Trainer, summarise
+from pace.rl.trainer import Trainer
 from pace.runs.checkpoint import CheckpointError, list_checkpoints, load_checkpoint
 from pace.runs.metrics import read_metrics
 from pace.runs.run_folder import RunFolder
