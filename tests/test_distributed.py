@@ -24,8 +24,9 @@ from pace.predictor.network import PredictorNetwork
 from pace.predictor.regression import PredictorTrainer
 from pace.rl.agent import Agent, RunningNorm
 from pace.rl.ppo import PPO
+from pace.rl.rates import summarise
 from pace.rl.rollout import Rollout
-from pace.rl.trainer import Trainer, begins_anew, summarise
+from pace.rl.trainer import Trainer, begins_anew
 from pace.runs.checkpoint import flatten_tensors, load_checkpoint
 from pace.runs.metrics import read_metrics
 from tests.helpers.algo import CPU, small_algo

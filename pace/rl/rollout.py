@@ -9,12 +9,13 @@ networks: what the policy acted on is bit for bit what it learns from.
 from __future__ import annotations
 
 import math
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
+from pace.predictor.regression import PredictorSource
 from pace.rl.agent import Agent
 
 CRITIC_ROWS = 8192  # rows of one critic pass after the rollout: bounds the memory of its activations
@@ -41,6 +42,28 @@ class VectorTask(Protocol):
 
     def first_bad(self) -> str | None:
         """World and term of the first value that is not finite, or None."""
+
+
+class TrainableTask(VectorTask, PredictorSource, Protocol):
+    """What the trainer asks of an environment beyond the rollout's interface."""
+
+    action_spec: Any
+
+    def pop_statistics(self) -> dict[str, Tensor]:
+        """Sums since the last call, 0-d tensors: serves, hits, successes, falls, episodes, steps, rewards, ..."""
+        ...
+
+    def warn_of_overflow(self) -> None:
+        """Warn, once, of worlds that the engine had no room for. May wait for the device."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that the next control step depends on."""
+        ...
+
+    def load_state_dict(self, state: dict[str, Any], /) -> None:
+        """Restore what :meth:`state_dict` gave."""
+        ...
 
 
 class Rollout:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -15,11 +14,12 @@ from pace.config.base import ConfigError, to_dict
 from pace.config.training import TrainConfig
 from pace.distributed import Team
 from pace.predictor.network import BallPredictor
-from pace.predictor.regression import PredictorSource, PredictorTrainer
+from pace.predictor.regression import PredictorTrainer
 from pace.rl.agent import Sizes
 from pace.rl.algorithm import ALGORITHMS
 from pace.rl.curriculum import Curriculum
-from pace.rl.rollout import RolloutError, VectorTask
+from pace.rl.rates import summarise
+from pace.rl.rollout import RolloutError, TrainableTask
 from pace.runs.checkpoint import (
     FOLDER,
     Checkpoint,
@@ -36,29 +36,6 @@ from pace.runs.run_folder import RunFolder, plot_learning_curve
 CHECKPOINTS_KEPT = 4
 LAST_GOOD = "last_good"  # folder in the run: the weights before an update that failed
 LEARNER, OLD_LEARNER = "algorithm", "ppo"  # part of a checkpoint's training state, and what it was called once
-COUNTS = ("serves", "hits", "successes", "falls", "episodes", "steps", "reward_sum")
-
-
-class TrainableTask(VectorTask, PredictorSource, Protocol):
-    """What the trainer asks of an environment beyond the rollout's interface."""
-
-    action_spec: Any
-
-    def pop_statistics(self) -> dict[str, Tensor]:
-        """Sums since the last call, 0-d tensors: serves, hits, successes, falls, episodes, steps, rewards, ..."""
-        ...
-
-    def warn_of_overflow(self) -> None:
-        """Warn, once, of worlds that the engine had no room for. May wait for the device."""
-        ...
-
-    def state_dict(self) -> dict[str, Any]:
-        """Everything that the next control step depends on."""
-        ...
-
-    def load_state_dict(self, state: dict[str, Any], /) -> None:
-        """Restore what :meth:`state_dict` gave."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -309,31 +286,3 @@ def played_on(checkpoint: Checkpoint) -> str:
 def _processes(checkpoint: Checkpoint) -> list[dict[str, Any]]:
     """What each process of a checkpoint's run kept of its own; nothing where only weights were."""
     return checkpoint.training["processes"] if checkpoint.training else []
-
-
-def summarise(statistics: dict[str, Tensor], control_dt: float, team: Team | None = None) -> dict[str, float]:
-    """Rates of the last rollout from the environments' sums over the ``team``; NaN where nothing was counted.
-
-    ``hit_rate`` and ``success_rate`` are shares of the serves that ended, ``fall_rate`` is falls per second of a
-    world's time, rewards are means per control step, and every other sum is given per serve.
-    """
-    total = (team or Team()).sum_(torch.stack([value.float() for value in statistics.values()]))
-    sums = dict(zip(statistics, total.tolist(), strict=True))
-
-    def share(name: str, of: str) -> float:
-        return sums[name] / sums[of] if sums[of] > 0 else math.nan
-
-    row = {
-        "hit_rate": share("hits", "serves"),
-        "success_rate": share("successes", "serves"),
-        "fall_rate": share("falls", "steps") / control_dt,
-        "mean_reward": share("reward_sum", "steps"),
-        "episodes": sums["episodes"],
-        "serves": sums["serves"],
-    }
-    for name in sums:
-        if name.startswith("reward/"):
-            row[name] = share(name, "steps")
-        elif name not in COUNTS:
-            row[name] = share(name, "serves")
-    return row

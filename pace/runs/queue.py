@@ -12,7 +12,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO
 
@@ -35,11 +35,13 @@ FREE_KEYS = (*RESUME_KEYS, "init_from", "predictor_from", "out")
 
 @dataclass(frozen=True)
 class Run:
-    """A training run: where it is kept, the overrides of a new one, and how many control steps it takes."""
+    """A training run: where it is kept, the overrides of a new one, how many control steps it takes, and the modules
+    from outside of pace that the user has named for it."""
 
     folder: Path
     overrides: tuple[str, ...]
     samples: float
+    plugins: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -65,26 +67,30 @@ class Run:
         """Of ``python -m pace.rl.train``, to begin the run or to go on with it."""
         limits = [f"samples={self.samples}", "minutes=0", "progress=false"]
         if list_checkpoints(self.folder):
-            modules = ",".join(load_train_config(list(self.overrides)).plugins)
-            return [f"resume={quote(str(self.folder))}", *([f"plugins=[{modules}]"] if modules else []), *limits]
+            modules = [f"plugins=[{','.join(self.plugins)}]"] if self.plugins else []
+            return [f"resume={quote(str(self.folder))}", *modules, *limits]
         return [*self.overrides, f"out={quote(str(self.folder))}", *limits]
 
 
-def check_settings(run: Run) -> None:
+def check_settings(run: Run) -> Run:
     """Compare the run that is in the folder, if any, with the one that is asked for.
+
+    Returns the run, with the modules from outside that its overrides name.
 
     Errors: :class:`ConfigError` that names a key in which they differ, or one that is wrong in what is asked for.
     """
-    asked = _flat(to_dict(load_train_config(list(run.overrides))))
+    config = load_train_config(list(run.overrides))
+    run, asked = replace(run, plugins=tuple(config.plugins)), _flat(to_dict(config))
     checkpoints = list_checkpoints(run.folder)
     if not checkpoints:
-        return
+        return run
     saved = read_meta(checkpoints[-1])["config"]
     there = _flat(to_dict(parse(saved, TrainConfig)))
     for key in sorted(set(asked) | set(there)):
         if not _is_free(key, asked) and asked.get(key) != there.get(key):
             what = f"{key} {there.get(key)}, and {asked.get(key)} is asked for"
             raise ConfigError(f"{run.folder} was trained with {what}: give another out=")
+    return run
 
 
 def _is_free(key: str, asked: Mapping[str, object]) -> bool:

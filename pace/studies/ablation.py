@@ -75,9 +75,7 @@ def short_name(experiment: str) -> str:
 
 def train(config: AblateConfig, out: Path) -> Mapping[str, str]:
     """Play the runs and write their CSVs into ``out``; returns the reasons of those that failed."""
-    runs = planned_runs(config)
-    for run in runs:
-        check_settings(run)
+    runs = [check_settings(run) for run in planned_runs(config)]
     queue = RunQueue(runs, config.jobs, config.progress)
     try:
         queue.play()

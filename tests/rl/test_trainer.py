@@ -17,8 +17,9 @@ from pace.config.base import ConfigError, parse, to_dict
 from pace.config.training import SchedulePoint, TrainConfig, load_train_config
 from pace.predictor.network import PredictorNetwork
 from pace.rl.ppo import AsymmetricPPO
+from pace.rl.rates import summarise
 from pace.rl.rollout import Rollout, RolloutError
-from pace.rl.trainer import Trainer, summarise
+from pace.rl.trainer import Trainer
 from pace.runs.checkpoint import CheckpointError, list_checkpoints, load_checkpoint
 from pace.runs.metrics import read_metrics
 from pace.runs.run_folder import RunFolder
@@ -173,6 +174,16 @@ def test_a_run_changes_to_float32_when_its_spread_is_small_and_resumes_exactly(
     resumed = narrowing(tmp_path / "parts", 5, resume=True)
     expected, found = all_weights(whole), all_weights(resumed)
     assert all(torch.equal(expected[name], found[name]) for name in expected)
+
+
+def test_a_checkpoint_of_before_there_were_other_algorithms_is_resumed(tmp_path: Path) -> None:
+    first, second = make_trainer(tmp_path / "first"), make_trainer(tmp_path / "second")
+    first.train()
+    old = first.checkpoint()
+    assert old.training is not None
+    old.training["ppo"] = old.training.pop("algorithm")
+    second.resume(old)
+    assert learner(second).ppo.actor_optimiser.state
 
 
 def test_rows_after_the_checkpoint_are_replaced_by_a_resume(tmp_path: Path) -> None:

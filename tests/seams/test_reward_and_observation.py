@@ -17,11 +17,13 @@ from pace.rl.policies import load_policy
 from pace.rl.train import main as train
 from pace.runs.checkpoint import CheckpointError
 from pace.runs.metrics import read_metrics
+from pace.runs.queue import Run, check_settings
 from pace.task.env import make_env
 from pace.task.observations import POLICY
 from pace.task.rewards import TERMS
 from pace.viewer.playback import Show
 from tests.helpers.outside import SMALL, command, python, stranger, write_module
+from tests.helpers.saved import save_run
 
 TERM = """
     from pace.task.rewards import term
@@ -157,3 +159,11 @@ def test_several_processes_and_a_resumed_run_know_the_module(folder: Path, tmp_p
 def test_a_stage_of_the_curriculum_may_bring_one(folder: Path) -> None:
     stage = "curriculum=[{samples: 9, task: ['reward.terms.fall.function=outside_term:still_joints']}]"
     assert load_train_config([stage]).plugins == ["outside_term"]
+
+
+def test_an_ablation_names_it_again_when_it_resumes_a_run(folder: Path, tmp_path: Path) -> None:
+    run = check_settings(Run(tmp_path / "run", (MINE, "seed=1"), 64.0))
+    assert run.plugins == ("outside_term",)
+    assert MINE in run.arguments()
+    save_run(tmp_path / "run")
+    assert run.arguments()[1] == "plugins=[outside_term]"

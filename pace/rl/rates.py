@@ -1,0 +1,40 @@
+"""Rates of a rollout, from the sums that the worlds keep."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from pace.distributed import Team
+
+COUNTS = ("serves", "hits", "successes", "falls", "episodes", "steps", "reward_sum")
+
+
+def summarise(statistics: dict[str, Tensor], control_dt: float, team: Team | None = None) -> dict[str, float]:
+    """Rates of the last rollout from the environments' sums over the ``team``; NaN where nothing was counted.
+
+    ``hit_rate`` and ``success_rate`` are shares of the serves that ended, ``fall_rate`` is falls per second of a
+    world's time, rewards are means per control step, and every other sum is given per serve.
+    """
+    total = (team or Team()).sum_(torch.stack([value.float() for value in statistics.values()]))
+    sums = dict(zip(statistics, total.tolist(), strict=True))
+
+    def share(name: str, of: str) -> float:
+        return sums[name] / sums[of] if sums[of] > 0 else math.nan
+
+    row = {
+        "hit_rate": share("hits", "serves"),
+        "success_rate": share("successes", "serves"),
+        "fall_rate": share("falls", "steps") / control_dt,
+        "mean_reward": share("reward_sum", "steps"),
+        "episodes": sums["episodes"],
+        "serves": sums["serves"],
+    }
+    for name in sums:
+        if name.startswith("reward/"):
+            row[name] = share(name, "steps")
+        elif name not in COUNTS:
+            row[name] = share(name, "serves")
+    return row
