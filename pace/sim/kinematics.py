@@ -136,32 +136,6 @@ def _update(
 
 
 @wp.kernel
-def _paddle_pose(
-    mask: wp.array[wp.bool],
-    masked: int,
-    chains: Chains,
-    base_position: wp.array2d[float],
-    base_quat: wp.array2d[float],
-    joint_position: wp.array2d[float],
-    centre: wp.array2d[float],
-    normal: wp.array2d[float],
-):
-    """Centre and normal of one world's paddle; masked: of those of the mask alone."""
-    world = wp.tid()
-    if masked == 1 and not mask[world]:
-        return
-    frame = Frame()
-    frame.position = wp.vec3(base_position[world, 0], base_position[world, 1], base_position[world, 2])
-    quat = base_quat[world]
-    frame.rotation = _quat(quat[0], quat[1], quat[2], quat[3])
-    for link in range(chains.start[PADDLE], chains.start[PADDLE + 1]):
-        frame = _link(chains, link, frame, joint_position[world, chains.joint[link]], 0.0)
-    frame = _moved(frame, chains.tip_offset[PADDLE])
-    _store(centre[world], 0, frame.position)
-    _store(normal[world], 0, wp.quat_rotate(frame.rotation, wp.vec3(1.0, 0.0, 0.0)))
-
-
-@wp.kernel
 def _paddle_jacobian_transpose(
     chains: Chains,
     qpos_path: wp.array3d[float],
@@ -251,9 +225,6 @@ class Kinematics:
         self._outputs = [wp.from_torch(t) for t in outputs]
         self._mask = torch.zeros(num_worlds, dtype=torch.bool, device=device)
         self._path: tuple[Tensor, Tensor] | None = None
-        self._sensed_centre = torch.zeros(num_worlds, 3, device=device)
-        self._sensed_normal = torch.zeros(num_worlds, 3, device=device)
-        self._sensed_pose: tuple[Tensor | None, ...] = (None, None, None)
         self._push: tuple[Tensor | None, ...] = (None, None, None)
 
     def update(self, qpos_path: Tensor, qvel_path: Tensor, mask: Tensor | None = None) -> None:
@@ -282,32 +253,6 @@ class Kinematics:
         mask, items = wp.from_torch(self._mask), (worlds, instants + len(TIPS) - 1)
         self._update = record(_update, items, [mask, 0, *inputs], self._device)
         self._update_masked = record(_update, items, [mask, 1, *inputs], self._device)
-
-    def paddle_pose(
-        self, base_position: Tensor, base_quat: Tensor, joint_position: Tensor, mask: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Paddle centre (N, 3) m and unit normal (N, 3), world frame, of any pose, for instance a sensed one.
-
-        Args: base_position (N, 3) m, base_quat (N, 4) wxyz, joint_position (N, 21) rad; mask (N,) bool: the worlds in
-        which they are new, ``None``: all. The two tensors returned are overwritten by the next call. Give the same
-        tensors each time: others are bound anew, which takes longer.
-        """
-        pose = (base_position, base_quat, joint_position)
-        if any(given is not bound for given, bound in zip(pose, self._sensed_pose, strict=True)):
-            self._bind_pose(pose)
-        if mask is None:
-            self._compute_pose()
-        else:
-            self._mask.copy_(mask)
-            self._compute_masked_pose()
-        return self._sensed_centre, self._sensed_normal
-
-    def _bind_pose(self, pose: tuple[Tensor, Tensor, Tensor]) -> None:
-        self._sensed_pose = pose
-        self._warp_pose = [wp.from_torch(t) for t in (*pose, self._sensed_centre, self._sensed_normal)]
-        inputs, mask = [self._chains, *self._warp_pose], wp.from_torch(self._mask)
-        self._compute_pose = record(_paddle_pose, self._num_worlds, [mask, 0, *inputs], self._device)
-        self._compute_masked_pose = record(_paddle_pose, self._num_worlds, [mask, 1, *inputs], self._device)
 
     def paddle_generalized_force(self, force: Tensor, point: Tensor, out: Tensor) -> None:
         """Write J^T f of a force on the paddle's link into ``out`` (N, 27), for the end of the path last given.
