@@ -113,7 +113,8 @@ class DeployedPolicy(nn.Module):
         check_policy(config)
         self.policy = policy.act
         self.onboard = Onboard(config, PaddleChain(model, RobotSpec.of(config.robot).paddle), policy.predictor)
-        self.names, self.history = list(config.observation.policy), config.observation.policy_history
+        self.seen = [POLICY[name].function for name in config.observation.policy]
+        self.history = config.observation.policy_history
         self.state = StateLayout(config)
         self.action_scale, self.action_clip = config.robot.action_scale, config.robot.action_clip
         self.register_buffer("nominal", torch.tensor(nominal_pose(config.robot), dtype=torch.float32))
@@ -139,7 +140,7 @@ class DeployedPolicy(nn.Module):
         estimates = {name: past[name] for name in self.onboard.estimates}
         launched = ball_launched[:, 0] > 0.5
         seen = self.onboard(sensing, past["action"], track, estimates, launched, started[:, 0])
-        frame = torch.cat([POLICY[name].function(seen).float() for name in self.names], dim=1)
+        frame = torch.cat([function(seen).float() for function in self.seen], dim=1)
         older = torch.where(started, past["history"], frame.repeat(1, self.history - 1))
         observation = torch.cat((older, frame), dim=1)
         action = self.policy(observation).clamp(-self.action_clip, self.action_clip)

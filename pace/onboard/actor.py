@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from pace.config.task import TaskConfig
 from pace.onboard.ball_track import BallTrack, Track
 from pace.onboard.estimate import Estimate
-from pace.onboard.estimates import ESTIMATES, make_estimates
+from pace.onboard.estimates import make_estimates, observed
 from pace.onboard.prediction import Prediction, PredictionReader, no_prediction
 from pace.sim.robot import nominal_pose
 
@@ -89,6 +89,7 @@ class Onboard(nn.Module):
         nominal = torch.tensor(nominal_pose(config.robot), dtype=torch.float32)
         self.register_buffer("nominal", nominal, persistent=False)
         self.track, self.reader = BallTrack(config), PredictionReader(config)
+        self.entries = observed(config.observation)
         self.estimates = nn.ModuleDict(make_estimates(config, len(nominal)))
         self.paddle = paddle
         self.predictor = predictor if config.predictor.enabled else None
@@ -143,8 +144,7 @@ class Onboard(nn.Module):
 
     def _advance(self, known: Mapping[str, Tensor], advance: Advance, for_the_pose: bool) -> dict[str, Tensor]:
         """New states of the estimates that the paddle's pose is computed from, or of the others."""
-        entries = {name: ESTIMATES[name] for name in self.estimates}
-        chosen = {name: entry for name, entry in entries.items() if bool(entry.replaces) == for_the_pose}
+        chosen = {name: entry for name, entry in self.entries.items() if bool(entry.replaces) == for_the_pose}
         return {name: advance(name, {read: known[read] for read in entry.reads}) for name, entry in chosen.items()}
 
     def _paddle_pose(self, sensing: Readings, states: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
@@ -152,7 +152,7 @@ class Onboard(nn.Module):
         seen = sensing._asdict()
         for name, state in states.items():
             columns = self.estimate(name).columns
-            seen |= {reading: state[:, columns[part]] for reading, part in ESTIMATES[name].replaces.items()}
+            seen |= {reading: state[:, columns[part]] for reading, part in self.entries[name].replaces.items()}
         joints = seen["joint_position"] + self.nominal
         return self.paddle(seen["base_position"], seen["projected_gravity"], seen["heading"], joints)
 

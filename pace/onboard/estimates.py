@@ -124,10 +124,9 @@ def check(config: TaskConfig) -> None:
     for name, entry in observed(observation).items():
         asked = next(seen for seen in observation.policy if seen in entry.observations)
         if numbers(observation, name) is None:
-            section = "estimates." if entry.numbers not in observation.built_in() else ""
-            raise ConfigError(
-                f"observation.policy has '{asked}': give observation.{section}{entry.numbers} (observation=memory)"
-            )
+            own = entry.numbers in observation.built_in()
+            where = f"{entry.numbers} (observation=memory)" if own else f"estimates.{entry.numbers}"
+            raise ConfigError(f"observation.policy has '{asked}': give observation.{where}")
         if config.predictor.frames < entry.frames:
             raise ConfigError(
                 f"observation '{asked}' needs predictor.frames of {entry.frames} or more, got {config.predictor.frames}"

@@ -151,31 +151,6 @@ def _update(
 
 
 @wp.kernel
-def _paddle_pose(
-    mask: wp.array[wp.bool],
-    chains: Chains,
-    base_position: wp.array2d[float],
-    base_quat: wp.array2d[float],
-    joint_position: wp.array2d[float],
-    centre: wp.array2d[float],
-    normal: wp.array2d[float],
-):
-    """Centre and normal of one masked world's paddle."""
-    world = wp.tid()
-    if not mask[world]:
-        return
-    frame = Frame()
-    frame.position = wp.vec3(base_position[world, 0], base_position[world, 1], base_position[world, 2])
-    quat = base_quat[world]
-    frame.rotation = _quat(quat[0], quat[1], quat[2], quat[3])
-    for link in range(chains.start[PADDLE], chains.start[PADDLE + 1]):
-        frame = _link(chains, link, frame, joint_position[world, chains.joint[link]], 0.0)
-    frame = _moved(frame, chains.tip_offset[PADDLE])
-    _store(centre[world], 0, frame.position)
-    _store(normal[world], 0, wp.quat_rotate(frame.rotation, wp.vec3(1.0, 0.0, 0.0)))
-
-
-@wp.kernel
 def _paddle_jacobian_transpose(
     chains: Chains,
     qpos_path: wp.array3d[float],
@@ -254,14 +229,10 @@ class Kinematics(Tips):
         self._chains = _build_chains(model, tips, wp.device_from_torch(self._device))
         self._num_worlds = num_worlds
         super().__init__(**vars(allocate(Tips, num_worlds, device, instants=substeps + 1, columns=12, feet=FEET)))
-        self._sensed_centre = torch.zeros(num_worlds, 3, device=device)
-        self._sensed_normal = torch.zeros(num_worlds, 3, device=device)
         self._path: tuple[Tensor, Tensor] | None = None
         n, instants = num_worlds, substeps + 1
         paths = {"qpos_path": (n, instants, model.nq), "qvel_path": (n, instants, model.nv)}
         self._update = Bound(self._record_update, **paths)
-        pose = {"base_position": (n, 3), "base_quat": (n, 4), "joint_position": (n, model.nu)}
-        self._pose = Bound(self._record_pose, **pose)
         self._push = Bound(self._record_push, **paths, force=(n, 3), point=(n, 3), out=(n, model.nv))
 
     def update(self, qpos_path: Tensor, qvel_path: Tensor, mask: Tensor | None = None) -> None:
@@ -277,23 +248,6 @@ class Kinematics(Tips):
         worlds, instants, _ = self.paddle_path.shape
         given = {"chains": self._chains, "qpos_path": qpos_path, "qvel_path": qvel_path}
         return MaskedLaunch(_update, (worlds, instants + self._num_tips - 1), self._device, tips=self, **given)
-
-    def paddle_pose(
-        self, base_position: Tensor, base_quat: Tensor, joint_position: Tensor, mask: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Paddle centre (N, 3) m and unit normal (N, 3), world frame, of any pose, for instance a sensed one.
-
-        Args: base_position (N, 3) m, base_quat (N, 4) wxyz, joint_position (N, J) rad; mask (N,) bool: the worlds in
-        which they are new, ``None``: all. The two tensors returned are overwritten by the next call. Give the same
-        tensors each time: others are bound anew, which takes longer.
-        """
-        self._pose(base_position, base_quat, joint_position)(mask)
-        return self._sensed_centre, self._sensed_normal
-
-    def _record_pose(self, base_position: Tensor, base_quat: Tensor, joint_position: Tensor) -> MaskedLaunch:
-        pose = {"base_position": base_position, "base_quat": base_quat, "joint_position": joint_position}
-        found = {"centre": self._sensed_centre, "normal": self._sensed_normal}
-        return MaskedLaunch(_paddle_pose, self._num_worlds, self._device, chains=self._chains, **pose, **found)
 
     def paddle_generalized_force(self, force: Tensor, point: Tensor, out: Tensor) -> None:
         """Write J^T f of a force on the paddle's link into ``out`` (N, 6 + J), for the end of the path last given.

@@ -55,23 +55,6 @@ def _late(line: wp.array2d[wp.float32], delay: float, column: int) -> float:
     return (1.0 - share) * line[age, column] + share * line[age + 1, column]
 
 
-@wp.func
-def orientation(gravity: wp.vec3, x: float, y: float) -> wp.vec4:
-    """Base quaternion w, x, y, z: gravity gives roll and pitch, heading (x, y) gives yaw (R = Rz Ry Rx)."""
-    roll = 0.5 * wp.atan2(-gravity[1], -gravity[2])
-    pitch = 0.5 * wp.atan2(gravity[0], wp.sqrt(gravity[1] * gravity[1] + gravity[2] * gravity[2]))
-    yaw = 0.5 * wp.atan2(y, x)
-    cr, sr = wp.cos(roll), wp.sin(roll)
-    cp, sp = wp.cos(pitch), wp.sin(pitch)
-    cy, sy = wp.cos(yaw), wp.sin(yaw)
-    return wp.vec4(
-        cr * cp * cy + sr * sp * sy,
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-    )
-
-
 @wp.kernel
 def _sense(
     mask: wp.array[wp.bool],
@@ -87,7 +70,6 @@ def _sense(
     amplitude: wp.array[wp.float32],
     line: wp.array3d[wp.float32],
     sensed: wp.array2d[wp.float32],
-    base_quat: wp.array[wp.vec4],
 ):
     """Sense one world. With ``reset`` the masked worlds only, as if they had stood still, with a new delay (control
     steps, from the range ``delays``) and a new scale of the noise; else their ball is new."""
@@ -112,8 +94,6 @@ def _sense(
     mocap = 6 + 2 * joints
     for column in range(line.shape[2]):
         row[mocap + column] += _late(line[world], delay[world], column)
-    gravity = wp.vec3(row[3], row[4], row[5])
-    base_quat[world] = orientation(gravity, row[mocap + HEADING], row[mocap + HEADING + 1])
 
 
 class Sensing(Stateful):
@@ -126,12 +106,11 @@ class Sensing(Stateful):
 
     Attributes: ``base_angular_velocity`` (N, 3) rad/s body frame, ``projected_gravity`` (N, 3), ``joint_position``
     (N, J) rad from the nominal pose, ``joint_velocity`` (N, J) rad/s, ``base_position`` (N, 3) m,
-    ``ball_position`` (N, 3) m, ``heading`` (N, 2), ``base_quat`` (N, 4) w, x, y, z as sensed gravity (roll, pitch) and
-    heading (yaw) give it, ``base_shift_noise`` (N, 2) m for what is computed from sensed values; world frame unless
-    said.
+    ``ball_position`` (N, 3) m, ``heading`` (N, 2), ``base_shift_noise`` (N, 2) m for what is computed from sensed
+    values; world frame unless said.
     """
 
-    STATE = ("_nominal", "_amplitude", "_sensed", "base_quat", "_line", "_delay", "_scale")
+    STATE = ("_nominal", "_amplitude", "_sensed", "_line", "_delay", "_scale")
 
     def __init__(
         self,
@@ -163,7 +142,6 @@ class Sensing(Stateful):
         views = torch.split(self._sensed, list(sizes.values()), dim=1)
         self.base_angular_velocity, self.projected_gravity, self.joint_position, self.joint_velocity = views[:4]
         self.base_position, self.ball_position, self.heading, self.base_shift_noise = views[4:]
-        self.base_quat = torch.zeros(num_worlds, 4, device=device)
         frames = max(2, math.ceil(self._delays[1]) + 1)
         self._line = torch.zeros(num_worlds, frames, MOCAP_COLUMNS, device=device)
         self._delay = torch.zeros(num_worlds, device=device)  # in control steps
@@ -191,6 +169,6 @@ class Sensing(Stateful):
         drawn = {"seed": self._seed, "delays": self._delays, "scales": self._scales, "amplitude": self._amplitude}
         truth = {"robot": robot, "ball_position": ball_position, "nominal": self._nominal}
         kept = {"delay": self._delay, "scale": self._scale, "line": self._line, "sensed": self._sensed}
-        given = drawn | truth | kept | {"base_quat": self.base_quat}
+        given = drawn | truth | kept
         update, reset = (MaskedLaunch(_sense, self._num_worlds, self._device, reset=reset, **given) for reset in (0, 1))
         return update, reset

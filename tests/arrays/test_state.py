@@ -13,7 +13,7 @@ from pace.task.env import TableTennisEnv
 from tests.helpers.fakes import config
 
 #: Part -> its tensors, as checkpoints have them since commit 43400ac. Those had a few more, which are computed from
-#: these: actor._base_quat, actor._joints, actor._nominal, actor.action and attitude.quat.
+#: these: actor._base_quat, actor._joints, actor._nominal, actor.action, attitude.quat and sensing.base_quat.
 STATE = {
     "": "generator",
     "actor": "apex paddle_normal paddle_position prediction shift target time",
@@ -27,7 +27,7 @@ STATE = {
     "game.target": "apex apex_time arriving idle_point playable point something_to_hit time",
     "policy": "frame observation",
     "rewards": "_weights reward sums values",
-    "sensing": "_amplitude _delay _line _nominal _scale _sensed base_quat",
+    "sensing": "_amplitude _delay _line _nominal _scale _sensed",
     "state": (
         "action apex arrival base_error feet_distance foot_contact foot_load lost mocap_delay nominal "
         "previous_action shift something_to_hit target"

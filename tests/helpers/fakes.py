@@ -7,7 +7,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from pace.arrays.tensors import allocate
 from pace.config.task import TaskConfig
@@ -73,21 +72,12 @@ def fake_robot(n: int) -> Any:
     )  # fmt: skip
 
 
-class FakeKinematics:
-    """A paddle that is always half a metre in front of the base and 0.3 m above it."""
-
-    def paddle_pose(
-        self, base_position: Tensor, base_quat: Tensor, joint_position: Tensor, mask: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        return base_position + torch.tensor([0.5, 0.0, 0.3]), torch.tensor([1.0, 0.0, 0.0]).expand_as(base_position)
-
-
 def fake_worlds(n: int) -> Any:
     """The attributes of :class:`pace.sim.worlds.Worlds` that the task reads."""
     return SimpleNamespace(
         num_worlds=n, device=CPU, control_dt=0.02, robot=fake_robot(n), ball=fake_ball(n),
         nominal=torch.linspace(-0.5, 0.5, 21), joint_lower=torch.full((21,), -1.0),
-        joint_upper=torch.full((21,), 1.0), spec=SPEC, kinematics=FakeKinematics(),
+        joint_upper=torch.full((21,), 1.0), spec=SPEC,
     )  # fmt: skip
 
 

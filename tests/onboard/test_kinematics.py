@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import mujoco
 import numpy as np
+import pytest
 import torch
 
 from pace.onboard.kinematics import PaddleChain, to_world
@@ -49,6 +52,32 @@ def test_paddle_and_base_as_the_simulation_has_them() -> None:
         site = data.site("paddle")
         np.testing.assert_allclose(centre[world], site.xpos, atol=1e-5)
         np.testing.assert_allclose(normal[world], site.xmat[[0, 3, 6]], atol=1e-5)
+
+
+@pytest.mark.parametrize(("roll", "pitch", "yaw"), [(0.0, 0.0, 0.0), (0.3, -0.2, 0.7), (-0.1, 0.4, -2.5)])
+def test_orientation_from_gravity_and_heading(roll: float, pitch: float, yaw: float) -> None:
+    def axis(angle: float, index: int) -> list[float]:
+        quat = [math.cos(angle / 2), 0.0, 0.0, 0.0]
+        quat[index] = math.sin(angle / 2)
+        return quat
+
+    def product(a: list[float], b: list[float]) -> list[float]:
+        w, x, y, z = a
+        q, i, j, k = b
+        return [
+            w * q - x * i - y * j - z * k, w * i + x * q + y * k - z * j,
+            w * j - x * k + y * q + z * i, w * k + x * j - y * i + z * q,
+        ]  # fmt: skip
+
+    expected = product(product(axis(yaw, 3), axis(pitch, 2)), axis(roll, 1))
+    w, x, y, z = expected
+    gravity = torch.tensor([[2 * (w * y - x * z), -2 * (y * z + w * x), 2 * (x * x + y * y) - 1]])
+    heading = torch.tensor([[1 - 2 * (y * y + z * z), 2 * (x * y + w * z)]])
+    matrix = np.zeros(9)
+    mujoco.mju_quat2Mat(matrix, np.array(expected))
+    # noise leaves neither of unit length
+    found = to_world(torch.eye(3).unsqueeze(2), 1.3 * gravity, 0.8 * heading)[..., 0]
+    np.testing.assert_allclose(found, matrix.reshape(3, 3), atol=1e-6)
 
 
 def test_it_agrees_with_the_simulations_own_chain() -> None:

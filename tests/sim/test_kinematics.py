@@ -80,13 +80,6 @@ def test_sole_centre_lies_between_its_corners(model):
     np.testing.assert_allclose(data.site("left_foot").xpos, below, atol=1e-9)
 
 
-def test_paddle_pose_of_a_sensed_state(path, kinematics):
-    qpos = torch.tensor(path[0][:, 1], dtype=torch.float32)
-    centre, normal = kinematics.paddle_pose(qpos[:, :3], qpos[:, 3:7], qpos[:, 7:])
-    np.testing.assert_allclose(centre, kinematics.paddle_path[:, 1, :3], atol=TOLERANCE)
-    np.testing.assert_allclose(normal, kinematics.paddle_path[:, 1, 3:6], atol=TOLERANCE)
-
-
 def test_generalized_force_is_the_jacobian_transpose(model, path, kinematics):
     generator = torch.Generator().manual_seed(1)
     force = torch.randn(WORLDS, 3, generator=generator) * 20

@@ -113,29 +113,3 @@ def test_reset_changes_only_masked_worlds() -> None:
     sensing.reset(mask, robot, ball_at(1.3))
     assert torch.equal(sensing._sensed[~mask], before[~mask])
     assert not torch.equal(sensing._sensed[mask], before[mask])
-
-
-@pytest.mark.parametrize(("roll", "pitch", "yaw"), [(0.0, 0.0, 0.0), (0.3, -0.2, 0.7), (-0.1, 0.4, -2.5)])
-def test_orientation_from_gravity_and_heading(roll: float, pitch: float, yaw: float) -> None:
-    def axis(angle: float, index: int) -> list[float]:
-        quat = [math.cos(angle / 2), 0.0, 0.0, 0.0]
-        quat[index] = math.sin(angle / 2)
-        return quat
-
-    def product(a: list[float], b: list[float]) -> list[float]:
-        w, x, y, z = a
-        q, i, j, k = b
-        return [
-            w * q - x * i - y * j - z * k, w * i + x * q + y * k - z * j,
-            w * j - x * k + y * q + z * i, w * k + x * j - y * i + z * q,
-        ]  # fmt: skip
-
-    expected = product(product(axis(yaw, 3), axis(pitch, 2)), axis(roll, 1))
-    w, x, y, z = expected
-    gravity = torch.tensor([[2 * (w * y - x * z), -2 * (y * z + w * x), 2 * (x * x + y * y) - 1]])
-    heading = torch.tensor([[1 - 2 * (y * y + z * z), 2 * (x * y + w * z)]])
-    sensing, robot = make(clean(0.0, 0.0)), fake_robot(4)
-    robot.projected_gravity.copy_(1.3 * gravity)  # noise leaves neither of unit length
-    robot.heading.copy_(0.8 * heading)
-    sensing.reset(ALL, robot, ball_at(1.0))
-    torch.testing.assert_close(sensing.base_quat, torch.tensor([expected]).repeat(4, 1), atol=1e-6, rtol=0)
