@@ -129,7 +129,7 @@ def test_only_what_is_observed_is_computed() -> None:
     assert list(observed(observation)) == ["memory", "delay", "attitude", "joints"]
     few = replace(observation, policy=["base_position", "estimated_heading"])
     assert list(observed(few)) == ["attitude"]
-    assert not observed(config("observation=pace").observation)
+    assert not observed(config("observation=paddle_pose").observation)
 
 
 def test_a_checkpoint_of_43400ac_has_all_that_is_put_back() -> None:
