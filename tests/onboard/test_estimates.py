@@ -21,7 +21,7 @@ from pace.rl.agent import Policy
 from pace.rl.policies import TaskPolicy, policy_size
 from pace.sim.robot import build_model
 from pace.task.env import TableTennisEnv
-from pace.task.observations import POLICY, check_policy
+from pace.task.observations import POLICY, check_policy, width
 from tests.helpers.fakes import config
 
 DATA = Path(__file__).parent / "data"
@@ -102,7 +102,7 @@ def test_one_from_outside_is_exported(registered: TrainConfig) -> None:
 
 
 def test_its_numbers_are_checked(registered: TrainConfig) -> None:
-    assert POLICY["usual_ball"].size == 3
+    assert width(POLICY["usual_ball"].size, 21) == 3
     check_policy(registered)
     for numbers, message in (
         ({"gain": 2.0}, r"observation\.estimates\.mean_ball: .*gain must lie in"),

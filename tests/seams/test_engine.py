@@ -25,7 +25,7 @@ PUPPET = """
             self.warmstart = torch.zeros_like(self.qvel)
 
         def _solver_state(self):
-            return self.qpos, self.qvel, self.warmstart
+            return {"qpos": self.qpos, "qvel": self.qvel, "warmstart": self.warmstart}
 
         def advance(self, targets, applied):
             last = self.qpos_path[:, -1].clone()
