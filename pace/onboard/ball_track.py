@@ -66,6 +66,6 @@ class BallTrack(nn.Module):
         return Track(positions, gone, ~(gone | self._nothing_to_hit(positions[:, -3:], change)))
 
     def _nothing_to_hit(self, position: Tensor, change: Tensor) -> Tensor:
-        """As for the referee (:func:`pace.task.game_kernels.nothing_to_hit`): past the robot, too low, falling."""
+        """As for the referee (:func:`pace.task.rules.nothing_to_hit`): past the robot, too low, falling."""
         x, z = position[:, 0], position[:, 2]
         return (x < self.past_x) | (z < self.low_z) | ((x < self.falling_x) & (change[:, 2] < 0.0))

@@ -1,6 +1,6 @@
 """Table tennis as a task: serves, the referee, and what the ball's forecast asks of the robot.
 
-The rules themselves are the kernels of :mod:`pace.task.game_kernels`; here are their tensors and their order.
+The kernels are in :mod:`pace.task.referee` and :mod:`pace.task.game_kernels`; here are their tensors and their order.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from pace.arrays.state import Stateful
 from pace.arrays.tensors import allocate, named_tensors
 from pace.config.task import ServeConfig, TaskConfig
 from pace.onboard.prediction import idle_point
-from pace.task import game_kernels
-from pace.task.game_kernels import Rules
+from pace.task import game_kernels, referee
 from pace.task.game_state import GameState
 from pace.task.outcome import Outcome
+from pace.task.rules import Rules
 
 if TYPE_CHECKING:
     from pace.sim.ball.ball import BallSim
@@ -67,7 +67,7 @@ class Game(GameState, Stateful):
     def _record(self, config: ServeConfig, ball: BallSim, base_position: Tensor) -> None:
         count, device, forecast = ball.num_worlds, ball.device, ball.forecast_result
         given = {"game": self, "ball": ball, "forecast": forecast, "rules": self.rules}
-        self._judge = Launch(game_kernels.judge, count, device, game=self, events=ball.events, ball=ball)
+        self._judge = Launch(referee.judge, count, device, game=self, events=ball.events, ball=ball)
         seen = {"events": ball.events, "paddle_distance": ball.nearest_paddle_distance}
         seen |= {"radius": ball.params.radius, "base_position": base_position}
         self._close = Launch(game_kernels.close, count, device, **given, **seen)

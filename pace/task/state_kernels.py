@@ -5,9 +5,9 @@ import warp as wp
 from pace.onboard.prediction import LONGEST_TIME
 from pace.sim.ball.state import BallArrays
 from pace.sim.robot_state import RobotArrays
-from pace.task.game_kernels import Rules, something_to_hit_now
 from pace.task.game_state import GameArrays
 from pace.task.measures import DerivedArrays, MeasureArrays
+from pace.task.rules import Rules, something_to_hit_now
 
 #: A foot that pushes with less touches nothing, N.
 CONTACT_FORCE = wp.constant(1.0)
@@ -120,6 +120,25 @@ def measure(
     measures.base_to_target[world] = wp.length(base_error[world])
 
 
+@wp.func
+def _derive_feet(robot: RobotArrays, derived: DerivedArrays, world: int):
+    for foot in range(2):
+        load = wp.length(robot.foot_force[world, foot])
+        derived.foot_load[world, foot] = load
+        derived.foot_contact[world, foot] = load > CONTACT_FORCE
+    derived.feet_distance[world] = wp.length(robot.foot_position[world, 0] - robot.foot_position[world, 1])
+
+
+@wp.func
+def _derive_progress(game: GameArrays, derived: DerivedArrays, rules: Rules, world: int):
+    progress = game.clock.time[world] / rules.max_duration
+    derived.serve_progress[world] = progress
+    episode = 0.0
+    if rules.serves_per_episode > 0:
+        episode = wp.min((game.clock.index[world] + progress) / float(rules.serves_per_episode), 1.0)
+    derived.episode_progress[world] = episode
+
+
 @wp.kernel
 def derive(
     game: GameArrays,
@@ -153,16 +172,7 @@ def derive(
     derived.paddle_to_target[world] = target - robot.paddle_position[world]
     for joint in range(nominal.shape[0]):
         derived.joint_offset[world, joint] = robot.joint_position[world, joint] - nominal[joint]
-    progress = game.clock.time[world] / rules.max_duration
-    derived.serve_progress[world] = progress
-    episode = 0.0
-    if rules.serves_per_episode > 0:
-        episode = wp.min((game.clock.index[world] + progress) / float(rules.serves_per_episode), 1.0)
-    derived.episode_progress[world] = episode
+    _derive_progress(game, derived, rules, world)
     derived.base_error[world] = goal - base
     derived.shift[world] = shift_goal - base
-    for foot in range(2):
-        load = wp.length(robot.foot_force[world, foot])
-        derived.foot_load[world, foot] = load
-        derived.foot_contact[world, foot] = load > CONTACT_FORCE
-    derived.feet_distance[world] = wp.length(robot.foot_position[world, 0] - robot.foot_position[world, 1])
+    _derive_feet(robot, derived, world)

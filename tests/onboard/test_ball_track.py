@@ -11,7 +11,7 @@ from pace.arrays.launch import Launch
 from pace.config.base import ConfigError
 from pace.onboard.ball_track import BallTrack
 from pace.task.game import rules_of
-from pace.task.game_kernels import Rules, nothing_to_hit
+from pace.task.rules import Rules, nothing_to_hit
 from tests.helpers.fakes import config
 
 NO = torch.zeros(1, dtype=torch.bool)

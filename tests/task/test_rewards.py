@@ -15,7 +15,8 @@ from pace.config.base import ConfigError
 from pace.config.task import RewardConfig, RewardTerm
 from pace.sim.ball.aero import GRAVITY
 from pace.sim.ball.ball import BallParams, BallSim
-from pace.task.rewards import TERMS, RewardFunction, RewardManager, paddle_speed
+from pace.task.ball_rewards import paddle_speed
+from pace.task.rewards import TERMS, RewardFunction, RewardManager
 from pace.task.state import JOINT_GROUPS, TaskState
 from tests.helpers.fakes import CPU, config, fake_state, set_events
 from tests.helpers.recipes import recipe

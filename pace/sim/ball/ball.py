@@ -17,9 +17,9 @@ from pace.arrays.launch import Bound, Launch, MaskedLaunch
 from pace.arrays.tensors import allocate
 from pace.config.base import ConfigError, config_dir, parse
 from pace.config.sim import BallConfig, TableConfig
-from pace.sim.ball.flight import Scene
 from pace.sim.ball.kernels import FORECAST_HORIZON, fly_step, forecast_flight, skip_flight
 from pace.sim.ball.rebound import Material
+from pace.sim.ball.scene import Scene
 from pace.sim.ball.state import BallEvents, BallState, Forecast
 
 __all__ = ["FORECAST_HORIZON", "BallEvents", "BallParams", "BallSim", "Forecast", "ball_preset"]
@@ -100,7 +100,7 @@ class BallParams:
         return data
 
 
-#: Order of the columns of the kernels' parameter tensor, which :func:`pace.sim.ball.flight.read_body` reads.
+#: Order of the columns of the kernels' parameter tensor, which :func:`pace.sim.ball.scene.read_body` reads.
 PARAM_NAMES = tuple(f.name for f in fields(BallParams))
 
 

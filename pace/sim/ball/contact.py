@@ -1,0 +1,150 @@
+"""The first contact of a ball on an arc, located by bisection, as Warp functions."""
+
+import warp as wp
+
+from pace.sim.ball.arc import Arc, arc_position, arc_velocity
+from pace.sim.ball.gaps import gap_to, surface_velocity
+from pace.sim.ball.scene import ALL_SURFACES, FLOOR, NET, NOTHING, PADDLE, TABLE, Scene
+
+#: m, a smaller gap counts as touching.
+TOUCH = 1.0e-5
+#: m/s, slower than this along the normal a touching ball rests; its hop would be 0.1 mm high and last 10 ms.
+REST_SPEED = 0.05
+BISECTIONS = 22
+
+_NEVER = wp.constant(1.0e6)
+
+
+@wp.struct
+class Contact:
+    """The first contact on an arc; ``surface`` is NOTHING where there is none."""
+
+    surface: wp.int32
+    time: wp.float32  # s since the arc's start
+    lasting: wp.bool  # it goes on: settled at the arc's end
+
+
+@wp.func
+def gap_rate(surface: int, arc: Arc, time: float, radius: float, scene: Scene, world: int) -> float:
+    """Rate (m/s) at which the gap opens, ``time`` s after the arc's start; negative when it closes."""
+    position = arc_position(arc, time)
+    clock = arc.clock + time
+    _gap, normal = gap_to(surface, position, clock, radius, scene, world)
+    velocity = surface_velocity(surface, position - radius * normal, clock, scene, world)
+    return wp.dot(arc_velocity(arc, time) - velocity, normal)
+
+
+@wp.func
+def closing_time(surface: int, arc: Arc, until: float, radius: float, scene: Scene, world: int) -> float:
+    """When the gap closes on the arc before ``until`` s, at which it is closed, by bisection."""
+    low = wp.float32(0.0)
+    high = wp.float32(until)
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        gap, _normal = gap_to(surface, arc_position(arc, middle), arc.clock + middle, radius, scene, world)
+        if gap > 0.0:
+            low = middle
+        else:
+            high = middle
+    return high
+
+
+@wp.func
+def grazing_time(surface: int, arc: Arc, radius: float, scene: Scene, world: int) -> float:
+    """When an arc that begins and ends clear of a surface touches it, or _NEVER: the gap's minimum decides."""
+    if gap_rate(surface, arc, 0.0, radius, scene, world) >= 0.0:
+        return _NEVER
+    if gap_rate(surface, arc, arc.duration, radius, scene, world) <= 0.0:
+        return _NEVER
+    low = wp.float32(0.0)
+    high = wp.float32(arc.duration)
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        if gap_rate(surface, arc, middle, radius, scene, world) < 0.0:
+            low = middle
+        else:
+            high = middle
+    gap, _normal = gap_to(surface, arc_position(arc, low), arc.clock + low, radius, scene, world)
+    if gap > 0.0:
+        return _NEVER
+    return closing_time(surface, arc, low, radius, scene, world)
+
+
+@wp.func
+def touching_contact(surface: int, arc: Arc, gap: float, radius: float, scene: Scene, world: int) -> Contact:
+    """Contact on an arc that begins on the surface, or inside it, at ``gap`` (m), and ends inside it."""
+    contact = Contact()
+    contact.surface = surface
+    before = gap_rate(surface, arc, 0.0, radius, scene, world)
+    if before < -REST_SPEED:
+        if gap > 0.0:
+            contact.time = closing_time(surface, arc, arc.duration, radius, scene, world)
+        return contact  # a paddle that closes in on a ball inside it strikes at once
+    if gap_rate(surface, arc, arc.duration, radius, scene, world) >= 0.0:
+        contact.surface = NOTHING  # still inside, but on its way out
+        return contact
+    contact.lasting = before <= REST_SPEED
+    contact.time = arc.duration
+    if not contact.lasting:
+        contact.time = closing_time(surface, arc, arc.duration, radius, scene, world)
+    return contact
+
+
+@wp.func
+def contact_with(
+    surface: int, arc: Arc, gap: float, end_gap: float, radius: float, scene: Scene, world: int
+) -> Contact:
+    """The first contact with ``surface`` on an arc over which its gap goes from ``gap`` to ``end_gap`` (m)."""
+    contact = Contact()
+    contact.surface = NOTHING
+    if gap <= TOUCH:
+        if end_gap < 0.0:
+            return touching_contact(surface, arc, gap, radius, scene, world)
+        return contact
+    time = wp.float32(_NEVER)
+    if end_gap < 0.0:
+        time = closing_time(surface, arc, arc.duration, radius, scene, world)
+    else:
+        time = grazing_time(surface, arc, radius, scene, world)
+    if time <= arc.duration:
+        contact.surface = surface
+        contact.time = time
+    return contact
+
+
+@wp.func
+def may_touch(gap: float, end_gap: float, speed: float, duration: float) -> bool:
+    """Whether a gap can close within a sub-step at whose ends it is ``gap`` and ``end_gap`` (m)."""
+    return end_gap < 0.0 or gap + end_gap < speed * duration
+
+
+@wp.func
+def first_contact(
+    arc: Arc,
+    gaps: wp.vec4,
+    end_gaps: wp.vec4,
+    speed: float,
+    paddle_speed: float,
+    radius: float,
+    scene: Scene,
+    world: int,
+) -> Contact:
+    """The earliest contact on an arc; ``speed`` bounds the ball's, ``paddle_speed`` the paddle's (m/s)."""
+    first = Contact()
+    first.surface = NOTHING
+    first.time = 2.0 * arc.duration
+    sums = gaps + end_gaps
+    still = wp.min(sums[TABLE], wp.min(sums[NET], sums[FLOOR]))
+    if still >= speed * arc.duration and sums[PADDLE] >= (speed + paddle_speed) * arc.duration:
+        return first  # all surfaces stay too far away
+    for surface in range(ALL_SURFACES):
+        relative = wp.float32(speed)
+        if surface == PADDLE:
+            relative += paddle_speed
+        gap = gaps[surface]
+        end_gap = end_gaps[surface]
+        if may_touch(gap, end_gap, relative, arc.duration):
+            contact = contact_with(surface, arc, gap, end_gap, radius, scene, world)
+            if contact.surface != NOTHING and contact.time < first.time:
+                first = contact
+    return first

@@ -1,0 +1,65 @@
+"""The rules of a serve: their numbers, and the conditions that several kernels ask, as Warp functions."""
+
+import warp as wp
+
+from pace.sim.ball.state import BallArrays
+from pace.task.game_state import GameArrays
+from pace.task.outcome import Outcome
+
+OPEN = wp.constant(int(Outcome.OPEN))
+SUCCESS = wp.constant(int(Outcome.SUCCESS))
+MISS = wp.constant(int(Outcome.MISS))
+NET = wp.constant(int(Outcome.NET))
+OUT = wp.constant(int(Outcome.OUT))
+OWN_SIDE = wp.constant(int(Outcome.OWN_SIDE))
+DOUBLE_HIT = wp.constant(int(Outcome.DOUBLE_HIT))
+VOLLEY = wp.constant(int(Outcome.VOLLEY))
+FALL = wp.constant(int(Outcome.FALL))
+BAD_SERVE = wp.constant(int(Outcome.BAD_SERVE))
+
+
+@wp.struct
+class Rules:
+    """Numbers of the configuration that the kernels need; m, s, world frame."""
+
+    control_dt: float
+    max_duration: float
+    end_after_hit: float  # 0: off
+    end_height: float
+    serves_per_episode: int  # 0: no end
+    min_base_height: float
+    bounds_x: wp.vec2
+    bounds_y: wp.vec2
+    intercept: int  # target: 1 the later of apex and x = target_x, 0 the apex with its x clamped
+    target_x: float
+    arm_offset: wp.vec2
+    idle_point: wp.vec3
+    idle_base: wp.vec2
+    past_x: float
+    low_z: float
+    falling_x: float
+
+
+@wp.func
+def nothing_to_hit(position: wp.vec3, velocity: wp.vec3, rules: Rules) -> bool:
+    """A ball that is past the robot, moves away, is too low, or falls behind the table cannot be hit any more."""
+    gone = position[0] < rules.past_x or velocity[0] > 0.0 or position[2] < rules.low_z
+    return gone or (position[0] < rules.falling_x and velocity[2] < 0.0)
+
+
+@wp.func
+def something_to_hit_now(game: GameArrays, ball: BallArrays, rules: Rules, world: int) -> bool:
+    undecided = game.referee.outcome[world] == OPEN and not game.referee.touched[world]
+    return undecided and not nothing_to_hit(ball.position[world], ball.velocity[world], rules)
+
+
+@wp.func
+def landed(opponent: bool, own: bool, net_touched: bool, x: float) -> int:
+    """Outcome of a hit ball by where it lands first; off the table it is out, or caught by the net."""
+    if opponent:
+        return SUCCESS
+    if net_touched and (own or x < 0.0):
+        return NET
+    if own:
+        return OWN_SIDE
+    return OUT
