@@ -16,23 +16,18 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from omegaconf import DictConfig
-from torch import Tensor
 
 from pace.config.base import parse, to_dict
 from pace.config.commands import ExportConfig
-from pace.config.overrides import ON_A_CPU
 from pace.config.training import TrainConfig
+from pace.deploy.check import compare, open_session
 from pace.deploy.graph import (
     DeployedPolicy,
-    StateLayout,
     input_ports,
     joints_of,
     output_ports,
-    readings,
     state_parts,
 )
 from pace.onboard.estimate import columns
@@ -40,14 +35,10 @@ from pace.rl.policies import TaskPolicy, load_policy
 from pace.runs.run_folder import VERSIONS, default_folder, git_state, versions
 from pace.sim.robot import build_model, joint_gains, motor_lines, nominal_pose
 from pace.sim.robot_spec import RobotSpec
-from pace.task.env import TableTennisEnv
 from pace.task.observations import POLICY, layout
 
 FILE = "policy.onnx"  # in the folder that the command writes
 FORMAT = 3  # of the metadata; 3: one frame of readings and one state
-ACTION_NOISE = 0.3  # standard deviation added to the actions while observations are recorded, so that they vary
-#: The check plays the task as saved, but for noise that is added to what the graph itself computes.
-CHECK_OVERRIDES = ("sensing.base_shift=0.0", *ON_A_CPU)
 #: What lies outside the file.
 PROCEDURE = (
     "Run at 1 / control_dt Hz: give the current readings, and as state the state_next of the call before. A state of "
@@ -56,8 +47,6 @@ PROCEDURE = (
     "position. Send joint_target to the position controllers with the gains kp and kd. World frame: origin on the "
     "floor below the table's centre, x towards the opponent, y to the robot's left, z up."
 )
-
-Session = Any  # onnxruntime has no type information
 
 
 class ExportError(RuntimeError):
@@ -218,87 +207,3 @@ def training_versions(policy: TaskPolicy) -> dict[str, Any] | None:
             except (OSError, ValueError):
                 return None
     return None
-
-
-class RawReadings:
-    """The graph's inputs as a robot would give them, from the sensors of an environment's N worlds.
-
-    Attributes: ``state`` (N, S), of the last call.
-    """
-
-    def __init__(self, env: TableTennisEnv, config: TrainConfig) -> None:
-        self._env, self._action = env, StateLayout(config).columns["action"]
-        self._launched = torch.zeros(env.num_worlds, 1)
-        self.state = torch.zeros(env.num_worlds, input_ports(config)["state"].size)
-
-    def push(self, new_ball: Tensor, state: NDArray[np.float32]) -> None:
-        """One control step later: ``new_ball`` (N,) bool, ``state`` (N, S) that the graph gave.
-
-        The action in it becomes the one that was done.
-        """
-        self._launched = new_ball.float().unsqueeze(1)
-        self.state = torch.from_numpy(state)
-        self.state[:, self._action] = self._env.task_state.action
-
-    def restart(self, mask: Tensor) -> None:
-        """Start from scratch in the worlds of ``mask`` (N,) bool."""
-        self.state[mask] = 0.0
-
-    def numpy(self) -> dict[str, NDArray[np.float32]]:
-        """What onnxruntime takes."""
-        sensing = self._env.sensing
-        frame = {name: getattr(sensing, name) for name in readings(0) if name != "ball_launched"}
-        frame["joint_position"] = sensing.joint_position + self._env.worlds.nominal
-        frame |= {"ball_launched": self._launched, "state": self.state}
-        return {name: value.contiguous().numpy() for name, value in frame.items()}
-
-
-def open_session(file: Path) -> Session:
-    """The file in onnxruntime, on one thread of the CPU."""
-    import onnxruntime
-
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 3  # errors
-    return onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
-
-
-def compare(session: Session, policy: TaskPolicy, config: ExportConfig) -> dict[str, float]:
-    """Largest difference of each output to what the task itself computes, over recorded observations.
-
-    Worlds play with the policy and some noise on its actions; serves follow one another and robots fall.
-    """
-    env = policy.make_env(config.check_worlds, "cpu", config.seed, CHECK_OVERRIDES)
-    readings, names = RawReadings(env, policy.config), list(output_ports(policy.config))
-    state = StateLayout(policy.config)
-    generator = torch.Generator().manual_seed(config.seed)
-    largest: dict[str, float] = {}
-    for _ in range(config.check_steps):
-        found = dict(zip(names, session.run(None, readings.numpy()), strict=True))
-        kept = found["state_next"]
-        found |= {name: kept[:, state.columns[name]] for name in env.actor.estimates}
-        action = policy(env.policy_observation)
-        for name, value in expected_outputs(env, policy, action).items():
-            difference = float(np.abs(found[name] - value.numpy()).max())
-            largest[name] = difference if np.isnan(difference) else max(largest.get(name, 0.0), difference)
-        env.advance(action + ACTION_NOISE * torch.randn(action.shape, generator=generator))
-        done = env.terminated | env.truncated
-        readings.push(env.game.ends.next_serve, kept)
-        env.reset_worlds(done)
-        readings.restart(done)
-    return largest
-
-
-def expected_outputs(env: TableTennisEnv, policy: TaskPolicy, action: Tensor) -> dict[str, Tensor]:
-    """The graph's outputs by name, and the states of the estimates in its state, as the environment has them."""
-    robot, actor = policy.config.robot, env.actor
-    clipped = action.clamp(-robot.action_clip, robot.action_clip)
-    return {
-        "joint_target": env.worlds.nominal + robot.action_scale * clipped,
-        "action": clipped,
-        "predicted_apex": actor.apex,
-        "predicted_target": actor.target,
-        "predicted_time": actor.time.unsqueeze(-1),
-        "something_to_hit": actor.track.something_to_hit.float().unsqueeze(-1),
-        **actor.estimates,
-    }

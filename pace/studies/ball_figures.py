@@ -23,14 +23,13 @@ from pace.runs.run_folder import default_folder
 from pace.sim.ball.ball import BallParams, BallSim, Forecast, ball_preset
 from pace.sim.ball.rebound import Material, rebound
 from pace.studies import ball_reference as reference
+from pace.studies.ball_strikes import frame_difference, phase_spread
 from pace.studies.ball_trials import (
     BALL_DT,
     PRESETS,
     fitted_drag,
     forecast_errors,
-    frame_difference,
     make_sim,
-    phase_spread,
     put,
     recorded_flights,
     true_drag,

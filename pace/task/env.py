@@ -1,9 +1,8 @@
-"""The table-tennis environment: N worlds in place, and as a TorchRL environment."""
+"""The table-tennis environment: N worlds of table tennis as a TorchRL environment."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
 import torch
@@ -12,47 +11,21 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from pace.arrays.graph import CapturedCall, graphs_wanted
-from pace.arrays.state import Stateful, tensors_named, under_prefix, with_prefix
 from pace.config.base import ConfigError
 from pace.config.task import TaskConfig
 from pace.onboard.actor import Predictor
-from pace.onboard.kinematics import PaddleChain
-from pace.sim.ball.state import BallState
-from pace.sim.sensing import Sensing
 from pace.sim.worlds import Worlds
-from pace.task.game import Game
-from pace.task.history import History
-from pace.task.observations import CRITIC, POLICY, check_critic, check_policy, layout
-from pace.task.resets import HeadStart, PoseSampler, ServeSampler
-from pace.task.rewards import RewardManager
-from pace.task.signals import ActorSignals
-from pace.task.state import TaskState
-from pace.task.statistics import Statistics
-
-#: The environment's own part of its state; the rest belongs to its parts.
-OWN_TENSORS = ("predictor_target", "predictor_time_to_apex", "_bad")
+from pace.task.observations import check_critic, check_policy
+from pace.task.table_tennis import TableTennis
 
 
-class TableTennisEnv(EnvBase):
+class TableTennisEnv(TableTennis, EnvBase):
     """N worlds of a humanoid that returns serves; batch size [N].
 
     As a TorchRL environment: ``policy`` (N, Dp) and ``critic`` (N, Dc) float32 observations, ``action`` (N, J) in
     units of ``robot.action_scale`` rad from the nominal pose, ``reward``, ``terminated``, ``truncated`` and ``done``
-    (N, 1). Under it lies an in-place interface without copies, :meth:`advance` and :meth:`reset_worlds`. The
-    constructor resets all worlds.
-
-    Attributes, overwritten in place: ``policy_observation`` (N, Dp), ``critic_observation`` (N, Dc), ``reward``,
-    ``terminated``, ``truncated`` (N,); for the predictor's regression ``predictor_input`` (N, 3 * frames) m sensed,
-    oldest first, ``predictor_target`` (N, P) truth in the order of ``predictor.outputs`` (times from now, s),
-    ``predictor_valid`` (N,) bool, ``predictor_time_to_apex`` (N,) s; for evaluation ``serve_over`` (N,) bool,
-    ``serve_outcome`` (N,) int (:class:`pace.task.game.Outcome`) and ``serve_hit`` (N,) bool of the serves that ended in
-    this step. ``warmup_serves``: so many first serves of each world are left out of the statistics.
-
-    On a GPU a step and a reset are a CUDA graph each (:class:`pace.arrays.graph.CapturedCall`; ``engine.graph``): the
-    configuration and the predictor's tensors are those of the second step, and are changed in place or not at all.
-
-    A task whose reward has no terms (:func:`pace.config.overrides.without_reward`) pays 0.
+    (N, 1). Under it lies an in-place interface without copies, :class:`pace.task.table_tennis.TableTennis`, with the
+    attributes that are overwritten. The constructor resets all worlds.
 
     Args:
         config: the task.
@@ -80,234 +53,9 @@ class TableTennisEnv(EnvBase):
         check_policy(config)
         check_critic(config.observation.critic)
         worlds = worlds or Worlds(config, num_worlds, device)
-        super().__init__(device=worlds.device, batch_size=(num_worlds,))
-        self.config, self.num_worlds, self.worlds = config, num_worlds, worlds
-        self.generator = worlds.generator
-        self.generator.manual_seed(seed)
-        self._build(predictor)
-        self._allocate()
+        EnvBase.__init__(self, device=worlds.device, batch_size=(num_worlds,))
+        TableTennis.__init__(self, config, worlds, seed, predictor)
         self._make_specs()
-        self._capture()
-        self.reset_worlds(self._everyone)
-
-    def _build(self, predictor: Predictor | None) -> None:
-        config, worlds, device = self.config, self.worlds, self.worlds.device
-        reward = config.reward
-        self._serves = ServeSampler(config.serve, self.num_worlds, self.generator, device)
-        late = config.serve.head_start[1] > 0
-        self._head_start = HeadStart(config.serve, worlds.ball, self.generator) if late else None
-        limits = (worlds.joint_lower, worlds.joint_upper)
-        self._poses = PoseSampler(config.reset, config.robot, self.num_worlds, worlds.nominal, limits, self.generator)
-        self.game = Game(config, worlds.ball, worlds.robot.base_position)
-        self.sensing = Sensing(
-            config.sensing, self.num_worlds, device, worlds.control_dt, worlds.nominal, self.generator
-        )
-        self.task_state = TaskState(worlds, self.game, self.sensing.delay)
-        ball, events = worlds.ball, worlds.ball.events
-        struck = BallState(events.hit_position, events.hit_velocity_out, events.hit_spin_out)
-        self._forecast_return = ball.forecaster(struck, reward.target_x)
-        self._forecast_serve = ball.forecaster(ball, reward.target_x)
-        self.rewards = RewardManager(reward, self.num_worlds, device, worlds.control_dt)
-        paddle = PaddleChain(worlds.model, worlds.spec.paddle)
-        self.actor = ActorSignals(config, self.sensing, self.task_state.action, paddle, predictor)
-
-    def _allocate(self) -> None:
-        names, count, device = self.config.observation, self.num_worlds, self.worlds.device
-        joints = len(self.worlds.spec.joints)
-        self.policy_layout, self.critic_layout = (
-            layout(names.policy, POLICY, joints),
-            layout(names.critic, CRITIC, joints),
-        )
-        policy = [partial(POLICY[name].function, self.actor) for name in names.policy]
-        critic = [partial(CRITIC[name].function, self.task_state) for name in names.critic]
-        self._policy_history = History(names.policy_history, policy)
-        self._critic_history = History(names.critic_history, critic)
-        self.policy_observation = self._policy_history.observation
-        self.critic_observation = self._critic_history.observation
-        self.reward = self.rewards.reward
-        self.predictor_input = self.actor.track.positions
-        self.predictor_target = torch.zeros_like(self.actor.prediction)
-        self.predictor_valid = self.task_state.something_to_hit
-        self.predictor_time_to_apex = torch.zeros(count, device=device)
-        self._everyone = torch.ones(count, dtype=torch.bool, device=device)
-        ends = self.game.ends
-        self.terminated, self.truncated = ends.lost, ends.truncated
-        self.serve_over, self.serve_outcome, self.serve_hit = ends.over, ends.outcome, ends.hit
-        self._bad = torch.zeros_like(self._everyone)
-        self.first_counted_serve, self._warmup_serves = torch.zeros((), device=device), 0
-        self.statistics = Statistics(self.game, self.first_counted_serve)
-
-    def _capture(self) -> None:
-        device = self.worlds.device
-        enabled = graphs_wanted(self.config.engine, device)
-        self._step_in_place = CapturedCall(self._advance, device, enabled, self.generator)
-        self._reset_in_place = CapturedCall(self._begin_episodes, device, enabled, self.generator)
-
-    @property
-    def warmup_serves(self) -> int:
-        """So many first serves of each world are left out of the statistics."""
-        return self._warmup_serves
-
-    @warmup_serves.setter
-    def warmup_serves(self, count: int) -> None:
-        self._warmup_serves = count
-        self.first_counted_serve.fill_(count)
-
-    # --- in place -----------------------------------------------------------------------------------------------------
-
-    @torch.no_grad()
-    def advance(self, action: Tensor) -> None:
-        """One control step with ``action`` (N, J), clipped to +- ``robot.action_clip``.
-
-        Order: (1) the action becomes joint targets; robot and ball move through the step, with the action's and the
-        sensors' delays inside it. (2) The referee consumes the ball's events in the order of their times; balls that
-        were hit get a forecast of their flight. (3) Falls and the ends of serves are seen, and serves that end are
-        decided. (4) Rewards, on that state. (5) Where a serve is over and the robot stands, the next serve begins at
-        once; also where the episode is truncated, so that its last observation, from which the value is bootstrapped,
-        is what would have come next. (6) Sensors, predictor, observations. Nothing is reset here: the observations
-        of worlds that are done are their last ones, until :meth:`reset_worlds`.
-        """
-        self._step_in_place(action)
-
-    def _advance(self, action: Tensor) -> None:
-        self._move(action)
-        self._judge()
-        self.task_state.refresh()
-        self.rewards.compute(self.task_state)
-        next_serve = self.game.ends.next_serve
-        self.statistics.add()
-        self.game.count_serves()
-        self._start_serves(next_serve)
-        self.sensing.update(self.worlds.robot, self.worlds.ball.position, next_serve)
-        self.actor.step(next_serve)
-        self._compute_truth()
-        self._policy_history.push()
-        self._critic_history.push()
-        self._flag_bad()
-
-    @torch.no_grad()
-    def reset_worlds(self, mask: Tensor) -> None:
-        """Begin new episodes in the worlds of ``mask`` (N,) bool and refresh their observations; others keep theirs.
-
-        On a CPU, where looking costs no wait, an empty mask returns at once.
-        """
-        if self.worlds.device.type == "cpu" and not bool(mask.any()):
-            return
-        self._reset_in_place(mask)
-
-    def _begin_episodes(self, mask: Tensor) -> None:
-        qpos, qvel = self._poses.sample(mask)
-        self.worlds.reset_robot(mask, qpos, qvel)
-        self.game.start_episode(mask, self.generator)
-        self._start_serves(mask, self._head_start)
-        for action in (self.task_state.action, self.task_state.previous_action):
-            action.masked_fill_(mask.unsqueeze(-1), 0.0)
-        self.sensing.reset(mask, self.worlds.robot, self.worlds.ball.position)
-        self.actor.begin(mask)
-        self._compute_truth()
-        self._policy_history.fill(mask)
-        self._critic_history.fill(mask)
-
-    def _move(self, action: Tensor) -> None:
-        robot, state = self.config.robot, self.task_state
-        state.previous_action.copy_(state.action)
-        torch.clamp(action, -robot.action_clip, robot.action_clip, out=state.action)
-        self.worlds.step(torch.add(self.worlds.nominal, state.action, alpha=robot.action_scale))
-
-    def _judge(self) -> None:
-        """Referee, forecast of the returns, ends of serves and episodes."""
-        self.game.judge()
-        self._forecast_return(self.game.referee.hit_now)
-        self.game.close()
-
-    def _start_serves(self, mask: Tensor, head_start: HeadStart | None = None) -> None:
-        self.worlds.serve(mask, *self._serves.sample(mask))
-        if head_start is not None:
-            head_start.give(mask)
-        self._forecast_serve(mask)
-        self.game.start_serve(mask)
-
-    def _compute_truth(self) -> None:
-        """What the critic sees and the predictor is taught, from the current state."""
-        self.task_state.derive()
-        target, now = self.game.target, self.game.clock.time
-        torch.sub(target.apex_time, now, out=self.predictor_time_to_apex)
-        truth = {"apex": target.apex, "target": target.point, "target_time": (target.time - now).unsqueeze(-1)}
-        torch.cat([truth[name] for name in self.config.predictor.outputs], dim=1, out=self.predictor_target)
-
-    # --- faults, statistics, state ------------------------------------------------------------------------------------
-
-    def _flag_bad(self) -> None:
-        """Remember the worlds in which a reward or an observation is not finite."""
-        total = self.reward + self._policy_history.frame.sum(1) + self._critic_history.frame.sum(1)
-        self._bad.logical_or_(total.isfinite().logical_not_())
-
-    def warn_of_overflow(self) -> None:
-        """See :meth:`pace.sim.worlds.Worlds.warn_of_overflow`."""
-        self.worlds.warn_of_overflow()
-
-    def first_bad(self) -> str | None:
-        """World and term of a value that was not finite, or None. Waits for the device: ask once an update."""
-        worlds = self._bad.nonzero()
-        if worlds.numel() == 0:
-            return None
-        world = int(worlds[0])
-        terms = self.rewards.values[:, world].isfinite().tolist()
-        bad = [f"reward term '{name}'" for name, finite in zip(self.rewards.names, terms, strict=True) if not finite]
-        groups = ((self._policy_history, self.policy_layout), (self._critic_history, self.critic_layout))
-        for history, columns in groups:
-            finite = history.frames[world].isfinite().all(0)
-            bad += [f"observation '{name}'" for name, where in columns.items() if not bool(finite[where].all())]
-        # the fault of an earlier step may have gone from the last values
-        return f"{bad[0] if bad else 'a reward or an observation'} of world {world} is not finite"
-
-    def pop_statistics(self) -> dict[str, Tensor]:
-        """Sums over worlds and steps since the last call, 0-d tensors: see :class:`pace.task.statistics.Statistics`;
-        ``reward_sum`` and ``reward/<term>`` as the learner sees them."""
-        terms = self.rewards.pop_sums()
-        sums = self.statistics.pop()
-        sums["reward_sum"] = torch.stack(list(terms.values())).sum() if terms else torch.zeros_like(self.reward[0])
-        return sums | {f"reward/{name}": value for name, value in terms.items()}
-
-    def _parts(self) -> dict[str, Stateful]:
-        return {
-            "worlds": self.worlds,
-            "game": self.game,
-            "state": self.task_state,
-            "sensing": self.sensing,
-            "policy": self._policy_history,
-            "critic": self._critic_history,
-            "rewards": self.rewards,
-            "statistics": self.statistics,
-        }
-
-    def _own_state(self) -> dict[str, Tensor]:
-        """Of the environment itself, and what the robot computes on board, whose names the estimates give."""
-        return with_prefix("env", tensors_named(self, OWN_TENSORS)) | self.actor.computed()
-
-    def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:  # type: ignore[override]
-        """Everything that the next step depends on, as copies: tensors by name, and ``generator``.
-
-        The predictor's weights are not part of it: they belong to whoever made it.
-        """
-        state = {name: tensor.clone() for name, tensor in self._own_state().items()}
-        for name, part in self._parts().items():
-            state |= with_prefix(name, part.state_dict())
-        return state | {"generator": self.generator.get_state()}
-
-    def load_state_dict(self, state_dict: dict[str, Any], *args: Any, **kwargs: Any) -> None:  # type: ignore[override]
-        """Put back what :meth:`state_dict` returned; the next step is then the same, bit for bit (but for MuJoCo
-        Warp on a GPU).
-
-        Errors: ``KeyError`` for a missing tensor, ``RuntimeError`` for another shape (number of worlds, layout).
-        """
-        for name, part in self._parts().items():
-            part.load_state_dict(under_prefix(name, state_dict))
-        for name, tensor in self._own_state().items():
-            tensor.copy_(state_dict[name])
-        self.generator.set_state(state_dict["generator"].cpu())
-
-    # --- TorchRL ------------------------------------------------------------------------------------------------------
 
     def _make_specs(self) -> None:
         batch, device = self.batch_size, self.worlds.device

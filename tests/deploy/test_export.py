@@ -22,7 +22,8 @@ from pace.config.commands import ExportConfig
 from pace.config.training import TrainConfig, load_train_config
 from pace.deploy import export
 from pace.deploy.__main__ import main
-from pace.deploy.export import ExportError, RawReadings, compare, export_policy, open_session, training_versions
+from pace.deploy.check import RawReadings, compare, open_session
+from pace.deploy.export import ExportError, export_policy, training_versions
 from pace.deploy.graph import DeployedPolicy, StateLayout, input_ports, output_ports, readings, results, state_parts
 from pace.predictor.network import PredictorNetwork
 from pace.rl.agent import Policy

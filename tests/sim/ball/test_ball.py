@@ -17,20 +17,8 @@ from pace.sim.ball.aero import GRAVITY
 from pace.sim.ball.ball import DEFAULT_PRESET, BallEvents, BallParams, BallSim, ball_preset
 from pace.sim.worlds import Worlds
 from pace.studies import ball_reference as reference
-from pace.studies.ball_trials import (
-    CONTROL_DT,
-    NO_AIR,
-    PRESETS,
-    REACH,
-    TABLE,
-    Swing,
-    far_path,
-    frame_difference,
-    make_sim,
-    phase_spread,
-    put,
-    random_strikes,
-)
+from pace.studies.ball_strikes import frame_difference, phase_spread, random_strikes
+from pace.studies.ball_trials import CONTROL_DT, NO_AIR, PRESETS, REACH, TABLE, Swing, far_path, make_sim, put
 from tests.helpers.robot import JOINT_NAMES
 
 DT = CONTROL_DT
