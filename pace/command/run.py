@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from pkgutil import resolve_name
 
 import hydra
 from hydra.errors import HydraException
@@ -23,18 +24,13 @@ EXIT_USAGE = 2
 EXIT_FAILED = 1
 EXIT_INTERRUPTED = 130
 
-Task = Callable[[DictConfig], None]
-#: What a command does, and the errors of it that are expected.
-Work = tuple[Task, tuple[type[Exception], ...]]
 
-
-def run_command(name: str, load: Callable[[], Work]) -> int:
+def run_command(name: str) -> int:
     """Run the command ``name`` of :data:`COMMANDS` with ``sys.argv``; returns the exit status.
 
-    ``load`` imports and returns the work; it is called when the configuration is composed, for torch takes seconds to
-    load. The work gets that configuration. Modules that the user names, in ``plugins`` or by an import path, are
-    imported first (:mod:`pace.config.plugins`). Wrong input gives one line and status 2, an expected error one line and
-    1.
+    Its work is imported when the configuration is composed, for torch takes seconds to load, and gets that
+    configuration. Modules that the user names, in ``plugins`` or by an import path, are imported first
+    (:mod:`pace.config.plugins`). Wrong input gives one line and status 2, an expected error one line and 1.
     """
     try:
         if {"-h", "--help"} & set(sys.argv[1:]):
@@ -43,7 +39,7 @@ def run_command(name: str, load: Callable[[], Work]) -> int:
     except ConfigError as error:
         return complain(str(error), EXIT_USAGE)
     try:
-        return _run_hydra(COMMANDS[name], load)
+        return _run_hydra(COMMANDS[name])
     except (HydraException, OmegaConfBaseException) as error:
         return complain(explain(name, sys.argv[1:], error), EXIT_USAGE)
     except KeyboardInterrupt:
@@ -56,7 +52,7 @@ def _topic(arguments: Sequence[str]) -> str:
     return next((argument for argument in arguments[index + 1 :] if re.fullmatch(r"\w+(=[\w/]+)?", argument)), "")
 
 
-def _run_hydra(command: Command, load: Callable[[], Work]) -> int:
+def _run_hydra(command: Command) -> int:
     """Compose the command's configuration with ``sys.argv`` and do the work; returns the exit status."""
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises its errors instead of printing and exiting
     status = 0
@@ -64,7 +60,7 @@ def _run_hydra(command: Command, load: Callable[[], Work]) -> int:
     def guarded(config: DictConfig) -> None:
         nonlocal status  # an error that reached Hydra would be announced a second time
         try:
-            task, failures = load()
+            work, *failures = (resolve_name(path) for path in (command.work, *command.failures))
         except ModuleNotFoundError as error:
             if not command.extra or (error.name or "").startswith("pace"):
                 raise
@@ -73,10 +69,10 @@ def _run_hydra(command: Command, load: Callable[[], Work]) -> int:
         try:
             if "plugins" in config:
                 plugins.use_named(config)
-            task(config)
+            work(config)
         except ConfigError as error:
             status = complain(str(error), EXIT_USAGE)
-        except failures as error:
+        except tuple(failures) as error:
             status = complain(str(error), EXIT_FAILED)
 
     hydra.main(config_path=str(config_dir()), config_name=command.config, version_base="1.3")(guarded)()

@@ -11,6 +11,7 @@ TRAIN_GROUPS = (
     "robot", "ball", "serve", "reset", "reward", "randomization", "sensing", "observation", "engine", "algo",
     "predictor", "experiment",
 )  # fmt: skip
+CHECKPOINT_ERROR = "pace.runs.checkpoint:CheckpointError"
 SAVED_RUN = (
     "RUN is a run folder, a checkpoint in one, or pretrained/<name>. The task is the one that was saved with the "
     "policy; change it as in training, by a choice of a group (ball=paper) or a value (engine.solver_iterations=20)."
@@ -22,8 +23,10 @@ class Command:
     """One command. ``--help`` shows it, and arguments are checked against it."""
 
     module: str  # python -m <module> is the same as pace <name>
+    work: str  # module:function of the composed configuration, imported when there is one
     config: str  # configs/<config>.yaml, whose keys it takes
     summary: str  # one line
+    failures: tuple[str, ...] = ()  # module:error of the errors that it may end with
     usage: str = "[key=value ...]"  # what stands behind its name
     about: str = ""  # a paragraph of the help
     examples: tuple[str, ...] = ()  # without the command's name
@@ -41,6 +44,8 @@ class Command:
 COMMANDS = {
     "train": Command(
         module="pace.rl.train",
+        work="pace.rl.session:train_from_config",
+        failures=("pace.distributed:TeamError", "pace.rl.rollout:RolloutError", CHECKPOINT_ERROR),
         config="train",
         summary="train a policy and its predictor",
         about="Writes a run folder: configuration, versions, metrics, checkpoints and learning curve. Ctrl-C saves and "
@@ -56,6 +61,8 @@ COMMANDS = {
     ),
     "evaluate": Command(
         module="pace.evaluation",
+        work="pace.evaluation.evaluate:evaluate_from_config",
+        failures=("pace.evaluation.serves:EvaluationError", CHECKPOINT_ERROR),
         config="evaluate",
         summary="hits and returns of a policy in the paper's serve ranges, and its robustness (--sweep)",
         usage="RUN [--sweep] [key=value ...]",
@@ -76,6 +83,8 @@ COMMANDS = {
     ),
     "play": Command(
         module="pace.viewer",
+        work="pace.viewer.play:play_from_config",
+        failures=(CHECKPOINT_ERROR, "pace.sim.render:RenderError", "pace.viewer.web:PageError"),
         extra="viewer",
         config="play",
         summary="a policy on a live page in the browser, or in a film (--video FILE)",
@@ -94,6 +103,8 @@ COMMANDS = {
     ),
     "export": Command(
         module="pace.deploy",
+        work="pace.deploy.export:export_from_config",
+        failures=("pace.deploy.export:ExportError", CHECKPOINT_ERROR),
         extra="export",
         config="export",
         summary="a policy as one ONNX file for the robot, checked against torch",
@@ -104,6 +115,8 @@ COMMANDS = {
     ),
     "ablate": Command(
         module="pace.studies.ablate",
+        work="pace.studies.ablation:ablate_from_config",
+        failures=("pace.studies.ablation:AblationError", CHECKPOINT_ERROR),
         config="ablate",
         summary="experiments x seeds, trained one after another, and the figure that compares them",
         about="Runs, CSVs and figure are in the folder out. The same command again skips finished runs and resumes the "
@@ -120,6 +133,8 @@ COMMANDS = {
     ),
     "keep": Command(
         module="pace.evaluation.keep",
+        work="pace.evaluation.publish:keep_from_config",
+        failures=("pace.evaluation.publish:KeepError", CHECKPOINT_ERROR),
         config="keep",
         summary="publish a policy: weights, metrics, evaluation and model card in one small folder",
         usage="RUN FOLDER [--evaluation FOLDER] [--notes FILE.md]",
@@ -130,6 +145,8 @@ COMMANDS = {
     ),
     "bench": Command(
         module="pace.bench",
+        work="pace.bench.measure:bench_from_config",
+        failures=("pace.bench.training:BenchError",),
         config="bench",
         summary="speed and memory of physics, environment, PPO update and training on this machine",
         about="Writes bench.json. Choices and values of the training change what is measured; keep the machine idle.",
@@ -140,6 +157,7 @@ COMMANDS = {
     ),
     "validate": Command(
         module="pace.studies.ball",
+        work="pace.studies.ball_figures:validate_from_config",
         extra="dev",
         config="validate",
         summary="the ball's flight and rebounds against independent solutions (extra dev)",
@@ -147,6 +165,7 @@ COMMANDS = {
     ),
     "predictor": Command(
         module="pace.predictor",
+        work="pace.rl.predictor_run:train_predictor",
         config="predictor_train",
         summary="train the predictor alone, on simulated serves without a robot",
         about="Ball, serves, sensing and their randomisation are those of the training. A policy starts with the "
@@ -161,6 +180,8 @@ COMMANDS = {
     ),
     "studies": Command(
         module="pace.studies",
+        work="pace.studies.catalogue:study_from_config",
+        failures=(CHECKPOINT_ERROR,),
         extra="dev",
         config="studies",
         summary="engines, step sizes, motors, what a predictor can know, ...: measured anew (extra dev)",

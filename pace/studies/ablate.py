@@ -1,25 +1,11 @@
 """``python -m pace.studies.ablate``: what each part of the recipe is worth; the same as ``pace ablate``."""
 
-from __future__ import annotations
-
 import sys
+from functools import partial
 
 from pace.command import run_command
-from pace.command.run import Work
 
-
-def main() -> int:
-    """Entry point; returns the exit status."""
-    return run_command("ablate", load)
-
-
-def load() -> Work:
-    """What the command does, and the errors that it may end with."""
-    from pace.runs.checkpoint import CheckpointError
-    from pace.studies.ablation import AblationError, ablate_from_config
-
-    return ablate_from_config, (CheckpointError, AblationError)
-
+main = partial(run_command, "ablate")
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -7,13 +7,14 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from pkgutil import resolve_name
 
 import pytest
 
 from pace.__main__ import main
 from pace.command.help import WIDTH, command_help, command_keys
 from pace.command.keys import file_keys, heading
-from pace.command.table import COMMANDS
+from pace.command.table import COMMANDS, Command
 from pace.config.base import compose, config_dir
 from pace.config.names import choices
 from pace.config.renamed import RENAMED_CHOICES
@@ -232,3 +233,9 @@ def test_old_commands_name_the_new_one(old: str) -> None:
 def test_pace_is_a_console_script() -> None:
     project = tomllib.loads(Path("pyproject.toml").read_text())["project"]
     assert project["scripts"] == {"pace": "pace.__main__:main"}
+
+
+@pytest.mark.parametrize("command", COMMANDS.values(), ids=COMMANDS)
+def test_work_and_failures_of_a_command_are_there(command: Command) -> None:
+    assert callable(resolve_name(command.work))
+    assert all(issubclass(resolve_name(path), Exception) for path in command.failures)
