@@ -13,8 +13,9 @@ from torch import Tensor
 
 from pace.evaluation.serves import COLUMNS, C, ServeRecorder, play, wilson
 from pace.rl.policies import TaskPolicy, load_policy
+from pace.runs.metrics import markdown
 from pace.sim.robot_spec import RobotSpec
-from pace.studies.common import COLOURS, ENDLESS, markdown
+from pace.studies.common import COLOURS, ENDLESS
 from pace.task.env import TableTennisEnv
 from pace.task.observations import POLICY, layout
 from pace.task.outcome import Outcome

@@ -6,7 +6,6 @@ import time
 from dataclasses import fields
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 import numpy as np
 import torch
 import warp as wp
@@ -34,8 +33,8 @@ from pace.studies.ball_trials import (
     recorded_flights,
     true_drag,
 )
+from pace.studies.common import COLOURS, save_figure
 
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")  # told apart by all kinds of colour vision
 SERVE = ([1.35, 0.0, 1.03], [-5.75, 0.0, 1.75])
 RETURN = ([-1.6, 0.0, 1.0], [5.5, 0.0, 2.2])
 
@@ -76,7 +75,7 @@ def draw_flight_errors(figure: Figure) -> None:
     errors = flight_errors(serves, BALL_DT)
     left, right = figure.subplots(1, 2)
     bins = np.geomspace(1e-2, 1e3, 41)
-    for (name, values), colour in zip(errors.items(), COLOURS, strict=True):
+    for (name, values), colour in zip(errors.items(), COLOURS, strict=False):
         unit = "μs" if name.endswith("time") else "μm"
         left.hist(np.maximum(values, bins[0]), bins, histtype="step", color=colour, label=f"{name} ({unit})", lw=1.5)
         print(f"{name}: median {np.median(values):.2f}, largest {values.max():.1f} {unit}")
@@ -86,7 +85,7 @@ def draw_flight_errors(figure: Figure) -> None:
     left.legend(frameon=False, fontsize=8, loc="center right")
     steps = np.array([0.25, 0.5, 1, 2, 4, 10, 20, 40])
     largest = [flight_errors(serves, 1e-3 * step) for step in steps]
-    for name, colour in zip(errors, COLOURS, strict=True):
+    for name, colour in zip(errors, COLOURS, strict=False):
         right.loglog(steps, [e[name].max() for e in largest], "o-", color=colour, lw=1.5, ms=4)
     right.axvline(1e3 * BALL_DT, color="0.5", ls=":", lw=1)
     right.set(xlabel="longest sub-step, ball_dt (ms)", ylabel="largest error (μm, μs)", ylim=(0.3, 1000))
@@ -109,7 +108,7 @@ def draw_rebound(figure: Figure) -> None:
     """What a rebound leaves of the tangential speed, and the spin that it gives: kernel (dots) and closed form."""
     slip = np.linspace(0.05, 8.0, 60)
     kept, turned = figure.subplots(1, 2)
-    for friction, colour in zip((0.1, 0.25, 0.38, 0.6), COLOURS, strict=True):
+    for friction, colour in zip((0.1, 0.25, 0.38, 0.6), COLOURS, strict=False):
         velocity, spin = torch.zeros(2, len(slip), 3)
         given = {"slip": torch.tensor(slip, dtype=torch.float32), "friction": friction}
         Launch(_strike, len(slip), torch.device("cpu"), velocity=velocity, spin=spin, **given)()
@@ -140,7 +139,7 @@ def draw_flights(axes: Axes, start: tuple[list[float], list[float]], title: str)
     table = ball_preset("paper").table
     axes.plot([-table.length / 2, table.length / 2], [table.height] * 2, color="0.3", lw=3)
     axes.plot([0, 0], [table.height, table.height + table.net_height], color="0.3", lw=1.5)
-    for preset, colour in zip(PRESETS, COLOURS, strict=True):
+    for preset, colour in zip(PRESETS, COLOURS, strict=False):
         way = trajectory(preset, *start)
         axes.plot(way[:, 0], way[:, 2], color=colour, lw=1.5, label=preset)
     axes.set(xlabel="x (m)", ylabel="z (m)", title=title, ylim=(0, 1.6), aspect="equal")
@@ -225,14 +224,9 @@ def validate_from_config(composed: DictConfig) -> None:
     config = parse(composed, ValidateConfig)
     out = Path(config.out) if config.out else default_folder("validate")
     out.mkdir(parents=True, exist_ok=True)
-    drawings = {"flight_error": draw_flight_errors, "rebound": draw_rebound, "presets": draw_presets}
-    sizes = {"flight_error": (9, 3.4), "rebound": (9, 3.4), "presets": (7.5, 5.4)}
-    with plt.rc_context({"axes.spines.top": False, "axes.spines.right": False, "font.size": 9}):
-        for name, draw in drawings.items():
-            figure = plt.figure(figsize=sizes[name], layout="constrained")
-            draw(figure)
-            figure.savefig(out / f"{name}.png", dpi=90)
-            print(f"wrote {out / name}.png")
+    save_figure(out / "flight_error.png", (9, 3.4), draw_flight_errors)
+    save_figure(out / "rebound.png", (9, 3.4), draw_rebound)
+    save_figure(out / "presets.png", (7.5, 5.4), draw_presets)
     print_presets()
     print_checks()
     print_speed()

@@ -7,12 +7,9 @@ They print the tables of the pages in ``docs/results`` and draw their figures.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import matplotlib.pyplot as plt
-from matplotlib.figure import Figure
 from omegaconf import DictConfig
 
 from pace.config.base import meant, parse, require
@@ -32,6 +29,7 @@ from pace.studies import (
     senses,
     steps,
 )
+from pace.studies.common import save_figure
 from pace.studies.swings import Swings, policy_swings, random_swings
 
 GENERALIST = Path("pretrained/campaign")
@@ -50,20 +48,11 @@ class Options:
     out: Path
 
 
-def _save(out: Path, name: str, size: tuple[float, float], draw: Callable[[Figure], None]) -> None:
-    with plt.rc_context({"axes.spines.top": False, "axes.spines.right": False, "font.size": 9}):
-        figure = plt.figure(figsize=size, layout="constrained")
-        draw(figure)
-        figure.savefig(out / f"{name}.png", dpi=90)
-        plt.close(figure)
-    print(f"wrote {out / name}.png")
-
-
 def study_reaction(options: Options) -> None:
     strikes = reaction.strike_all(options.worlds)
     print(reaction.table(strikes))
     print(f"cost: {1e3 * reaction.cost():.2f} ms a control step of 1,024 worlds")
-    _save(options.out, "paddle_reaction", (9, 3.2), lambda figure: reaction.draw(strikes, figure))
+    save_figure(options.out / "paddle_reaction.png", (9, 3.2), lambda figure: reaction.draw(strikes, figure))
 
 
 def study_parity(options: Options) -> None:
@@ -71,7 +60,7 @@ def study_parity(options: Options) -> None:
     print(parity.table(found))
     print()
     print(parity.strike_table(found))
-    _save(options.out, "engine_parity", (9.5, 3.2), lambda figure: parity.draw(found, figure))
+    save_figure(options.out / "engine_parity.png", (9.5, 3.2), lambda figure: parity.draw(found, figure))
 
 
 def _swings(options: Options) -> Swings:
@@ -83,7 +72,7 @@ def _swings(options: Options) -> Swings:
 def study_steps(options: Options) -> None:
     cases = steps.step_cases(_swings(options).windows(steps.LENGTH))
     print(steps.table(cases))
-    _save(options.out, "step_size", (9.5, 3.2), lambda figure: steps.draw_steps(cases, figure))
+    save_figure(options.out / "step_size.png", (9.5, 3.2), lambda figure: steps.draw_steps(cases, figure))
 
 
 def study_solver(options: Options) -> None:
@@ -103,7 +92,7 @@ def study_posture(options: Options) -> None:
 def study_adaptation(options: Options) -> None:
     found = adaptation.adaptations(_policies(options), options.worlds)
     print(adaptation.table(found))
-    _save(options.out, "adaptation", (11.5, 3.2), lambda figure: adaptation.draw(found, figure))
+    save_figure(options.out / "adaptation.png", (11.5, 3.2), lambda figure: adaptation.draw(found, figure))
 
 
 def study_senses(options: Options) -> None:
@@ -127,7 +116,7 @@ def study_predictor(options: Options) -> None:
         found.append(predictor.compare(case, options.serves, options.predictors))
         print(f"{case}: done", flush=True)
     print(predictor.table(found))
-    _save(options.out, "predictor", (9.5, 3.6), lambda figure: predictor.draw(found, figure))
+    save_figure(options.out / "predictor.png", (9.5, 3.6), lambda figure: predictor.draw(found, figure))
 
 
 def study_recipe(options: Options) -> None:

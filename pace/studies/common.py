@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable
 from functools import lru_cache
+from pathlib import Path
 
+import matplotlib.pyplot as plt
 import mujoco
 import numpy as np
 import torch
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
 from pace.config.training import TrainConfig, load_train_config
 from pace.sim.robot import build_model
 from pace.sim.robot_spec import RobotSpec
+from pace.sim.worlds import Worlds
 
 Array = NDArray[np.float64]
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")  # told apart by all kinds of vision
@@ -55,6 +59,14 @@ def standing(config: TrainConfig, num_worlds: int) -> Tensor:
     return qpos
 
 
+def standing_worlds(config: TrainConfig, num_worlds: int) -> Worlds:
+    """Worlds on the CPU whose robots stand still as :func:`standing` says."""
+    worlds = Worlds(config, num_worlds, "cpu")
+    everyone = torch.ones(num_worlds, dtype=torch.bool)
+    worlds.reset_robot(everyone, standing(config, num_worlds), torch.zeros(num_worlds, worlds.model.nv))
+    return worlds
+
+
 def smooth_swings(nominal: Tensor, num_worlds: int, steps: int, seed: int, arm: float, rest: float) -> Tensor:
     """Joint targets (T, N, J) rad round ``nominal`` (J,): a sum of three sines of 0.5 to 2.5 Hz a joint.
 
@@ -76,10 +88,14 @@ def model_of(config: TrainConfig) -> mujoco.MjModel:
     return build_model(config.robot, config.engine, config.ball.table)
 
 
-def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table for a page of ``docs/``."""
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+def save_figure(file: Path, size: tuple[float, float], draw: Callable[[Figure], None]) -> None:
+    """Draw a figure of ``size`` inches, write it to ``file`` and say so."""
+    with plt.rc_context({"axes.spines.top": False, "axes.spines.right": False, "font.size": 9}):
+        figure = plt.figure(figsize=size, layout="constrained")
+        draw(figure)
+        figure.savefig(file, dpi=90)
+        plt.close(figure)
+    print(f"wrote {file}")
 
 
 def quantiles(values: Array) -> tuple[float, float]:

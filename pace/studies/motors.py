@@ -19,10 +19,11 @@ from pace.config.sim import RobotConfig
 from pace.config.training import load_train_config
 from pace.evaluation.serves import ServeRecorder, play, summarise
 from pace.rl.policies import TaskPolicy, load_policy
+from pace.runs.metrics import markdown
 from pace.sim.engine.native import stop_timers
 from pace.sim.robot import motor_lines
 from pace.sim.robot_spec import RobotSpec
-from pace.studies.common import ENDLESS, Array, markdown, model_of, study_config, study_spec
+from pace.studies.common import ENDLESS, Array, model_of, study_config, study_spec
 from pace.task.env import TableTennisEnv
 
 ROBOT = "robot=t1"  # the limit is of configs/, not of a policy that was trained before it

@@ -20,8 +20,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pace.runs.metrics import markdown
 from pace.sim.worlds import Worlds
-from pace.studies.common import COLOURS, Array, markdown, model_of, smooth_swings, standing, study_config, study_spec
+from pace.studies.common import COLOURS, Array, model_of, smooth_swings, standing, study_config, study_spec
 from pace.studies.throws import throw
 
 STEPS = 50  # control steps: one second

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from pace.evaluation.serves import ServeRecorder, play
 from pace.rl.policies import TaskPolicy, load_policy
-from pace.studies.common import ENDLESS, markdown
+from pace.runs.metrics import markdown
+from pace.studies.common import ENDLESS
 from pace.task.env import TableTennisEnv
 
 SEED = 7
@@ -27,7 +28,6 @@ MEASURES = {
     "lean of the trunk": "degrees",
 }
 SCALES = torch.tensor([100.0, 1.0, 1.0, 1.0, 1.0])
-PHASES = (AT_BALL, WAITING)
 
 
 class PostureRecorder(ServeRecorder):

@@ -17,7 +17,8 @@ from pace.config.training import TrainConfig
 from pace.evaluation.report import bin_label
 from pace.predictor.regression import BIN_NAMES, TIME_BINS
 from pace.rl.policies import load_predictor
-from pace.studies.common import COLOURS, markdown
+from pace.runs.metrics import markdown
+from pace.studies.common import COLOURS
 from pace.studies.flights import Recording, record
 from pace.studies.posterior import Question, answer
 

@@ -11,8 +11,9 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from pace.runs.metrics import markdown
 from pace.sim.worlds import Worlds
-from pace.studies.common import COLOURS, Array, markdown, smooth_swings, standing, study_config
+from pace.studies.common import COLOURS, Array, smooth_swings, standing_worlds, study_config
 from pace.studies.throws import throw
 
 SPEEDS = (4.0, 6.0, 8.0, 10.0, 12.0)  # m/s, ball against blade along the normal
@@ -70,10 +71,7 @@ def strike_all(worlds_each: int, gains: float = 1.0) -> Strikes:
 def _play(count: int, speed: Tensor, reaction: bool, gains: float) -> tuple[Tensor, Worlds, dict[str, Tensor]]:
     """Swing, strike, follow through: paddle (T, N, 12) after the strike, the worlds, and what the strike was."""
     config = study_config(paddle_reaction=reaction)
-    worlds = Worlds(config, count, "cpu")
-    worlds.reset_robot(
-        torch.ones(count, dtype=torch.bool), standing(config, count), torch.zeros(count, worlds.model.nv)
-    )
+    worlds = standing_worlds(config, count)
     targets = smooth_swings(worlds.nominal, count, SWING_STEPS + FOLLOW_STEPS + 1, SEED, arm=0.6, rest=0.02)
     for step in range(SWING_STEPS):
         worlds.step(targets[step])
@@ -128,9 +126,7 @@ def _effective_masses(worlds: Worlds, struck: dict[str, Tensor]) -> Array:
 def cost(num_worlds: int = 1024, repeats: int = 200) -> float:
     """Least time (s) that the reaction adds to a control step of ``num_worlds`` worlds."""
     config = study_config(paddle_reaction=True)
-    worlds = Worlds(config, num_worlds, "cpu")
-    everyone = torch.ones(num_worlds, dtype=torch.bool)
-    worlds.reset_robot(everyone, standing(config, num_worlds), torch.zeros(num_worlds, worlds.model.nv))
+    worlds = standing_worlds(config, num_worlds)
     seconds = []
     for _ in range(repeats):
         started = time.perf_counter()

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from pace.rl.agent import MLP, Policy
 from pace.rl.policies import TaskPolicy, load_policy
-from pace.studies.common import ENDLESS, markdown
+from pace.runs.metrics import markdown
+from pace.studies.common import ENDLESS
 
 STEPS = 100  # control steps that each world plays
 SEED = 6

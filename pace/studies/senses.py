@@ -12,7 +12,8 @@ from torch import Tensor
 from pace.config.base import ConfigError
 from pace.onboard.estimates import observed
 from pace.rl.policies import TaskPolicy, load_policy
-from pace.studies.common import ENDLESS, markdown
+from pace.runs.metrics import markdown
+from pace.studies.common import ENDLESS
 from pace.task.env import TableTennisEnv
 from pace.task.observations import POLICY
 

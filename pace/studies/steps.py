@@ -9,18 +9,10 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
+from pace.runs.metrics import markdown
 from pace.sim.engine.factory import make_engine
 from pace.sim.kinematics import Kinematics
-from pace.studies.common import (
-    COLOURS,
-    Array,
-    carrying,
-    markdown,
-    model_of,
-    quantiles,
-    study_config,
-    study_spec,
-)
+from pace.studies.common import COLOURS, Array, carrying, model_of, quantiles, study_config, study_spec
 from pace.studies.swings import Windows
 
 ENGINES = ("native", "mjwarp")

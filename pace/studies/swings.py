@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pace.rl.policies import load_policy
 from pace.sim.worlds import Worlds
-from pace.studies.common import smooth_swings, standing, study_config
+from pace.studies.common import smooth_swings, standing_worlds, study_config
 
 RECORDED_DT = 0.002  # s, physics step of the recording
 SEED = 7
@@ -52,10 +52,7 @@ class Windows:
 def random_swings(num_worlds: int, steps: int) -> Swings:
     """A standing robot whose arm follows random sines."""
     config = study_config(physics_dt=RECORDED_DT)
-    worlds = Worlds(config, num_worlds, "cpu")
-    worlds.reset_robot(
-        torch.ones(num_worlds, dtype=torch.bool), standing(config, num_worlds), torch.zeros(num_worlds, worlds.model.nv)
-    )
+    worlds = standing_worlds(config, num_worlds)
     targets = smooth_swings(worlds.nominal, num_worlds, steps, SEED, arm=0.6, rest=0.03)
     states = []
     for step in range(steps):

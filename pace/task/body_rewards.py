@@ -5,34 +5,36 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pace.task.reward_terms import Params, length, term
+from pace.task.reward_terms import TERMS, Params, RewardFunction, length, term
 from pace.task.state import TaskState
 
-# --- posture and motion of the base -----------------------------------------------------------------------------------
+#: Terms that are a measure as it stands (:class:`pace.task.measures.Measures`): name -> measure.
+MEASURED = {
+    "base_vertical_velocity": "vertical_velocity",  # squared, (m/s)^2
+    "base_roll_pitch_rate": "roll_pitch_rate",  # squared, (rad/s)^2
+    "base_yaw_rate": "yaw_rate",  # squared, (rad/s)^2
+    "base_tilt": "base_tilt",  # squared horizontal part of gravity in the body frame
+    "undesired_contact": "contacts",  # number of bodies other than the feet that touch something
+    "joint_power": "joint_power",  # norm over the joints of torque times velocity, W
+    "ankle_power": "ankle_power",  # the same over the ankles
+    "joint_acceleration": "joint_acceleration",  # squared, summed over the joints, (rad/s^2)^2
+    "action_rate": "action_change",  # squared change of the action, summed over the joints
+    # sum of |joint - nominal|, rad; the first: hip yaw and roll, waist and left arm without its shoulder roll
+    "deviation_hip_waist_left_arm": "hip_waist_left_arm",
+    "deviation_left_shoulder_roll": "left_shoulder_roll",
+    "deviation_right_arm": "right_arm",
+    "foot_tilt": "foot_tilt",  # squared horizontal part of the soles' normals, summed over the feet
+    "foot_slide": "foot_slide",  # horizontal speed of the feet in contact, summed, m/s
+}
 
 
-@term()
-def base_vertical_velocity(state: TaskState, params: Params) -> Tensor:
-    """Squared, (m/s)^2."""
-    return state.measures["vertical_velocity"]
+def measured(name: str) -> RewardFunction:
+    """The term that is the measure ``name``."""
+    return RewardFunction(lambda state, params: state.measures[name], ())
 
 
-@term()
-def base_roll_pitch_rate(state: TaskState, params: Params) -> Tensor:
-    """Squared, (rad/s)^2."""
-    return state.measures["roll_pitch_rate"]
-
-
-@term()
-def base_yaw_rate(state: TaskState, params: Params) -> Tensor:
-    """Squared, (rad/s)^2."""
-    return state.measures["yaw_rate"]
-
-
-@term()
-def base_tilt(state: TaskState, params: Params) -> Tensor:
-    """Squared horizontal part of gravity in the body frame."""
-    return state.measures["base_tilt"]
+for _name, _measure in MEASURED.items():
+    TERMS.enter(_name, measured(_measure))
 
 
 @term("x", "margin", "sigma")
@@ -48,43 +50,10 @@ def fall(state: TaskState, params: Params) -> Tensor:
     return state.lost.float()
 
 
-@term()
-def undesired_contact(state: TaskState, params: Params) -> Tensor:
-    """Number of bodies other than the feet that touch something."""
-    return state.measures["contacts"]
-
-
 @term("distance")
 def paddle_near_head(state: TaskState, params: Params) -> Tensor:
     """How much nearer than ``distance`` the paddle is to the head, m."""
     return (params["distance"] - state.measures["paddle_to_head"]).clamp(min=0.0)
-
-
-# --- joints -----------------------------------------------------------------------------------------------------------
-
-
-@term()
-def joint_power(state: TaskState, params: Params) -> Tensor:
-    """Norm over the joints of torque times velocity, W."""
-    return state.measures["joint_power"]
-
-
-@term()
-def ankle_power(state: TaskState, params: Params) -> Tensor:
-    """The same over the ankles."""
-    return state.measures["ankle_power"]
-
-
-@term()
-def joint_acceleration(state: TaskState, params: Params) -> Tensor:
-    """Squared, summed over the joints, (rad/s^2)^2."""
-    return state.measures["joint_acceleration"]
-
-
-@term()
-def action_rate(state: TaskState, params: Params) -> Tensor:
-    """Squared change of the action, summed over the joints."""
-    return state.measures["action_change"]
 
 
 @term("fraction")
@@ -95,42 +64,9 @@ def joint_limits(state: TaskState, params: Params) -> Tensor:
 
 
 @term()
-def deviation_hip_waist_left_arm(state: TaskState, params: Params) -> Tensor:
-    """Sum of |joint - nominal| over hip yaw and roll, waist and left arm without its shoulder roll, rad."""
-    return state.measures["hip_waist_left_arm"]
-
-
-@term()
-def deviation_left_shoulder_roll(state: TaskState, params: Params) -> Tensor:
-    """|joint - nominal|, rad."""
-    return state.measures["left_shoulder_roll"]
-
-
-@term()
-def deviation_right_arm(state: TaskState, params: Params) -> Tensor:
-    """Sum of |joint - nominal|, rad."""
-    return state.measures["right_arm"]
-
-
-# --- feet -------------------------------------------------------------------------------------------------------------
-
-
-@term()
 def both_feet_air(state: TaskState, params: Params) -> Tensor:
     """No foot touches the floor."""
     return (state.measures["feet_down"] == 0.0).float()
-
-
-@term()
-def foot_tilt(state: TaskState, params: Params) -> Tensor:
-    """Squared horizontal part of the soles' normals, summed over the feet."""
-    return state.measures["foot_tilt"]
-
-
-@term()
-def foot_slide(state: TaskState, params: Params) -> Tensor:
-    """Horizontal speed of the feet in contact, summed, m/s."""
-    return state.measures["foot_slide"]
 
 
 @term("reach", "sigma")
