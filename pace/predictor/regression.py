@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pace.config.predictor import PredictorConfig
-from pace.distributed import Team
+from pace.distributed import ProcessGroup
 from pace.predictor.network import BallPredictor
 from pace.runs.optimiser import load_optimiser_state, optimiser_state
 
@@ -30,7 +30,7 @@ class PredictorTrainer:
     """Adam on a :class:`BallPredictor`, which it changes in place, over samples of the last (steps, N) rollout.
 
     After ``config.train_updates`` updates the network is frozen (0: never); errors are measured all the same. The
-    processes of a ``team`` share the samples of a batch.
+    processes of a ``group`` share the samples of a batch.
     """
 
     def __init__(
@@ -39,10 +39,10 @@ class PredictorTrainer:
         config: PredictorConfig,
         steps: int,
         num_worlds: int,
-        team: Team | None = None,
+        group: ProcessGroup | None = None,
     ) -> None:
         device = next(network.parameters()).device
-        self.network, self.config, self.team = network, config, team or Team()
+        self.network, self.config, self.group = network, config, group or ProcessGroup()
         self.updates = 0
         self.optimiser = torch.optim.Adam(network.parameters(), lr=config.learning_rate)
         self._num_worlds, self._device, self._first_steps = num_worlds, device, steps
@@ -97,7 +97,7 @@ class PredictorTrainer:
         sums = torch.zeros(2, len(BIN_NAMES), device=squared.device)
         sums[0].index_add_(0, bins, squared * weight)
         sums[1].index_add_(0, bins, weight)
-        self.team.sum_(sums)
+        self.group.all_reduce_sum_(sums)
         totals = torch.cat([sums.sum(1, keepdim=True), sums], dim=1)
         return dict(zip(names, (100.0 * (totals[0] / totals[1]).sqrt()).tolist(), strict=True))
 
@@ -110,7 +110,7 @@ class PredictorTrainer:
         valid = self.valid.flatten()
         by_validity = torch.argsort(valid, descending=True, stable=True)
         count = valid.sum()
-        rows = max(1, self.config.batch_size // self.team.size)
+        rows = max(1, self.config.batch_size // self.group.size)
         for _ in range(self._batches):
             draw = torch.rand(rows, device=valid.device)
             index = by_validity[(draw * count).long()]
@@ -118,7 +118,7 @@ class PredictorTrainer:
             loss = (error.square().mean(1) * valid[index]).mean()  # zero where the rollout had no valid sample at all
             self.optimiser.zero_grad(set_to_none=True)
             loss.backward()
-            self.team.mean_([p.grad for p in self.network.parameters() if p.grad is not None])
+            self.group.all_reduce_mean_([p.grad for p in self.network.parameters() if p.grad is not None])
             self.optimiser.step()
 
     def state_dict(self) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from torchrl.modules import IndependentNormal
 
 from pace.config.base import ConfigError
 from pace.config.training import AlgoConfig, SchedulePoint
-from pace.distributed import Team
+from pace.distributed import ProcessGroup
 
 SMALLEST_STD = 1e-4  # the scale module's own lower bound
 VARIANCE_FLOOR = 1e-4  # observations that hardly vary are not blown up: the divisor is at least 0.01
@@ -109,18 +109,18 @@ class RunningNorm(nn.Module):
         return self.count.clone(), self.mean.clone(), self.var.clone()
 
     @torch.no_grad()
-    def pool(self, before: tuple[Tensor, Tensor, Tensor], team: Team) -> None:
-        """Make one set of moments of what each process of ``team`` has merged since all had the moments ``before``.
+    def pool(self, before: tuple[Tensor, Tensor, Tensor], group: ProcessGroup) -> None:
+        """Make one set of moments of what each process of ``group`` has merged since all had the moments ``before``.
 
         In powers about the old mean, what a process saw is a plain difference of sums, and those add up.
         """
-        if team.size == 1 or not self.learns:
+        if group.size == 1 or not self.learns:
             return
         count, mean, var = before
         shift = self.mean - mean
         first = self.count * shift
         second = self.count * (self.var + shift.square()) - count * var
-        seen = team.sum_(torch.cat(((self.count - count).view(1), first, second)))
+        seen = group.all_reduce_sum_(torch.cat(((self.count - count).view(1), first, second)))
         self.count.copy_(count + seen[0])
         shift = seen[1 : self.size + 1] / self.count
         self.mean.copy_(mean + shift)

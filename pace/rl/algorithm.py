@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from pace.config import plugins
 from pace.config.training import AlgoConfig
-from pace.distributed import Team
+from pace.distributed import ProcessGroup
 from pace.rl.agent import Sizes
 from pace.rl.ppo import AsymmetricPPO
 from pace.rl.rollout import VectorTask
@@ -19,13 +19,13 @@ from pace.rl.rollout import VectorTask
 class Algorithm(Protocol):
     """Acts in the worlds of a run and learns from what happens there.
 
-    The trainer makes one with ``(sizes, config, device, team)``, before any world has moved. Then for each update:
+    The trainer makes one with ``(sizes, config, device, group)``, before any world has moved. Then for each update:
     :meth:`prepare`, :meth:`begin`, :meth:`step` for each control step, :meth:`finish`, :meth:`fault`, :meth:`update`.
-    Between the steps the trainer records what the predictor learns from. All processes of the ``team`` do the same
+    Between the steps the trainer records what the predictor learns from. All processes of the ``group`` do the same
     calls; each has worlds of its own, and after an update the same weights.
     """
 
-    def __init__(self, sizes: Sizes, config: AlgoConfig, device: torch.device, team: Team) -> None: ...
+    def __init__(self, sizes: Sizes, config: AlgoConfig, device: torch.device, group: ProcessGroup) -> None: ...
 
     @property
     def agent(self) -> nn.Module:

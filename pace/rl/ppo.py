@@ -17,7 +17,7 @@ from torchrl.objectives import ClipPPOLoss, KLAdaptiveLR
 from pace.arrays.state import under_prefix
 from pace.config.base import ConfigError
 from pace.config.training import AlgoConfig
-from pace.distributed import Team
+from pace.distributed import ProcessGroup
 from pace.rl.agent import Agent, Policy, RunningNorm, Sizes, scheduled
 from pace.rl.rollout import Rollout, RolloutError, VectorTask
 from pace.runs.checkpoint import load_weights
@@ -55,11 +55,11 @@ class PPOLoss(ClipPPOLoss):
 class PPO:
     """Learner of an :class:`Agent`: one optimiser, gradient bound and parameter set each for actor and critic.
 
-    The processes of a ``team`` learn from the union of their rollouts: gradients, KL and metrics are means over them.
+    The processes of a ``group`` learn from the union of their rollouts: gradients, KL and metrics are means over them.
     """
 
-    def __init__(self, agent: Agent, config: AlgoConfig, team: Team | None = None) -> None:
-        self.agent, self.config, self.team = agent, config, team or Team()
+    def __init__(self, agent: Agent, config: AlgoConfig, group: ProcessGroup | None = None) -> None:
+        self.agent, self.config, self.group = agent, config, group or ProcessGroup()
         self.loss = PPOLoss(
             agent.actor_operator(),
             agent.critic_operator(),
@@ -100,7 +100,7 @@ class PPO:
                 totals.append(self._learn(batch))
         self.agent.actor.bound_std(self.config.std_floor, scheduled(self.config.std, samples))
         mean = torch.stack(totals).mean(0)
-        self.team.mean_([mean])
+        self.group.all_reduce_mean_([mean])
         metrics: dict[str, float] = dict(zip(METRICS, mean.tolist(), strict=True))
         self._require_finite(metrics)
         metrics["lr"] = self.schedule.get_last_lr()[0]
@@ -113,9 +113,9 @@ class PPO:
         self.critic_optimiser.zero_grad(set_to_none=True)
         out = self.loss(batch)
         (out["loss_objective"] + out["loss_entropy"]).backward()
-        receive_actors = self.team.mean_later([self.loss.kl, *gradients(self.actor_parameters)])
+        receive_actors = self.group.all_reduce_mean_later([self.loss.kl, *gradients(self.actor_parameters)])
         out["loss_critic"].backward()  # while the actor's gradients travel; the critic's do while the actor learns
-        receive_critics = self.team.mean_later(gradients(self.critic_parameters))
+        receive_critics = self.group.all_reduce_mean_later(gradients(self.critic_parameters))
         receive_actors()
         kl = self.loss.kl.item()
         if not math.isfinite(kl):
@@ -134,9 +134,9 @@ class PPO:
         steps = rollout.steps
         advantage = rollout.advantage.view(-1, 1)
         mean = advantage.mean()
-        self.team.mean_([mean])
+        self.group.all_reduce_mean_([mean])
         variance = (advantage - mean).square().mean()
-        self.team.mean_([variance])
+        self.group.all_reduce_mean_([variance])
         return {
             "policy": rollout.policy.flatten(0, 1),
             "critic": rollout.critic[:steps].flatten(0, 1),
@@ -195,10 +195,10 @@ class AsymmetricPPO:
 
     rollout: Rollout | None = None
 
-    def __init__(self, sizes: Sizes, config: AlgoConfig, device: torch.device, team: Team) -> None:
-        self.config, self.team = config, team
+    def __init__(self, sizes: Sizes, config: AlgoConfig, device: torch.device, group: ProcessGroup) -> None:
+        self.config, self.group = config, group
         self.agent = Agent(*sizes, config, device)
-        self.ppo = PPO(self.agent, config, team)
+        self.ppo = PPO(self.agent, config, group)
 
     def prepare(self, env: VectorTask, samples: float) -> int:
         """Storage for these worlds, the steps of ``algo.later_steps``, and the networks' number format."""
@@ -234,7 +234,7 @@ class AsymmetricPPO:
     def update(self, samples: float) -> dict[str, float]:
         """One set of normalisers for all processes, then :meth:`PPO.update`."""
         for norm, moments in zip(self._norms(), self._moments, strict=True):
-            norm.pool(moments, self.team)
+            norm.pool(moments, self.group)
         return self.ppo.update(self._stored, samples)
 
     def _norms(self) -> tuple[RunningNorm, RunningNorm]:

@@ -88,7 +88,7 @@ class ServePractice:
 
     def _serve(self, mask: Tensor) -> None:
         ball, wide = self.ball, mask.unsqueeze(-1)
-        self._randomizer.draw(mask)
+        self._randomizer.sample(mask)
         launch = self._serves.sample(mask)
         for value, start in zip((ball.position, ball.velocity, ball.spin), launch, strict=True):
             value.copy_(torch.where(wide, start, value))

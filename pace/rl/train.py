@@ -15,12 +15,12 @@ def main() -> int:
 
 def load() -> Work:
     """What the command does, and the errors that it may end with."""
-    from pace.distributed import TeamError
+    from pace.distributed import ProcessGroupError
     from pace.rl.rollout import RolloutError
     from pace.rl.session import train_from_config
     from pace.runs.checkpoint import CheckpointError
 
-    return train_from_config, (TeamError, RolloutError, CheckpointError)
+    return train_from_config, (ProcessGroupError, RolloutError, CheckpointError)
 
 
 if __name__ == "__main__":

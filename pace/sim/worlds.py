@@ -231,7 +231,7 @@ class Worlds(Stateful):
 
     def reset_robot(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
         """Put the robots of ``mask`` (N,) bool into qpos (N, 7 + J), qvel (N, 6 + J); sample their parameters."""
-        self.randomizer.draw(mask)
+        self.randomizer.sample(mask)
         self._update_delay()
         self.engine.apply_params(mask)
         self.engine.reset(mask, qpos, qvel)

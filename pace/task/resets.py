@@ -6,7 +6,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from pace.arrays.draws import Column, Draws, columns_of
+from pace.arrays.draws import Column, UniformSampler, columns_of
 from pace.arrays.launch import Launch
 from pace.config.sim import RobotConfig
 from pace.config.task import ResetConfig, ServeConfig
@@ -31,14 +31,14 @@ class ServeSampler:
         launch = torch.zeros(num_worlds, 9, device=device)
         self._launch = launch[:, :3], launch[:, 3:6], launch[:, 6:]
         ranges = [config.x, config.y, config.z, config.vx, config.vy, config.vz, config.spin, config.spin, config.spin]
-        self._draw = Draws(columns_of(launch, ranges), generator)
+        self._sample = UniformSampler(columns_of(launch, ranges), generator)
 
     def sample(self, mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Position m, velocity m/s and spin rad/s, each (N, 3), world frame: new in the worlds of ``mask`` (N,) bool.
 
         The tensors are the same ones each time.
         """
-        self._draw(mask)
+        self._sample(mask)
         return self._launch
 
 
@@ -47,12 +47,12 @@ class HeadStart:
 
     def __init__(self, config: ServeConfig, ball: BallSim, generator: torch.Generator) -> None:
         duration = torch.zeros(ball.num_worlds, device=ball.device)
-        self._draw = Draws([Column(duration, *config.head_start)], generator)
+        self._sample = UniformSampler([Column(duration, *config.head_start)], generator)
         self._skip = ball.skipper(duration)
 
     def give(self, mask: Tensor) -> None:
         """Another time for each world of ``mask`` (N,) bool; its ball moves on by that."""
-        self._draw(mask)
+        self._sample(mask)
         self._skip(mask)
 
 
@@ -80,7 +80,7 @@ class PoseSampler:
         ends = zip(*(limit.tolist() for limit in limits), strict=True)
         ranges = _joint_ranges(config, RobotSpec.of(robot), nominal.tolist())
         columns += columns_of(self._qpos[:, 7:], [(*pair, *end) for pair, end in zip(ranges, ends, strict=True)])
-        self._draw = Draws(columns, generator)
+        self._sample = UniformSampler(columns, generator)
         self._turn = Launch(turn, num_worlds, device, yaw=yaw, qpos=self._qpos)
 
     def sample(self, mask: Tensor) -> tuple[Tensor, Tensor]:
@@ -88,7 +88,7 @@ class PoseSampler:
 
         New in the worlds of ``mask`` (N,) bool; the tensors are the same ones each time.
         """
-        self._draw(mask)
+        self._sample(mask)
         self._turn()
         return self._qpos, self._qvel
 
