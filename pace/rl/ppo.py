@@ -37,8 +37,8 @@ METRICS = ("kl", "grad_norm_actor", "grad_norm_critic", *LOSS_METRICS)
 class PPOLoss(ClipPPOLoss):
     """ClipPPOLoss that also reports the exact mean KL divergence between the two Gaussians.
 
-    The loss's own ``kl_approx`` is a mean of log-ratios: its noise over a small minibatch is a good part of the KL
-    target, and it can be negative, which the learning-rate schedule ignores.
+    The loss's ``kl_approx`` is a mean of log-ratios: over a small minibatch its noise is comparable to the KL target,
+    and it can be negative, which the learning-rate schedule ignores.
     """
 
     kl: Tensor
@@ -85,7 +85,7 @@ class PPO:
     def update(self, rollout: Rollout, samples: float) -> dict[str, float]:
         """Learn from one rollout, ``samples`` control steps into the run; returns the means of the update's metrics.
 
-        Errors: :class:`RolloutError` when a loss is not finite; the weights are then not to be saved.
+        Errors: :class:`RolloutError` if a loss is not finite; the weights must then not be saved.
         """
         self.loss.get_buffer("entropy_coeff").fill_(scheduled(self.config.entropy, samples))
         self.schedule.target_kl = scheduled(self.config.kl_target, samples)
@@ -114,7 +114,7 @@ class PPO:
         out = self.loss(batch)
         (out["loss_objective"] + out["loss_entropy"]).backward()
         receive_actors = self.group.all_reduce_mean_later([self.loss.kl, *gradients(self.actor_parameters)])
-        out["loss_critic"].backward()  # while the actor's gradients travel; the critic's do while the actor learns
+        out["loss_critic"].backward()  # overlaps with the all-reduce of the actor's gradients, and vice versa below
         receive_critics = self.group.all_reduce_mean_later(gradients(self.critic_parameters))
         receive_actors()
         kl = self.loss.kl.item()
@@ -149,7 +149,7 @@ class PPO:
         }
 
     def _buffers(self, rollout: Rollout) -> TensorDict:
-        """The minibatch that all gathers write into; allocated at the first update from that storage."""
+        """The minibatch buffers that all gathers write into; allocated at the first update from that storage."""
         if self._minibatch is None or self._minibatch[0] is not rollout:
             rows = rollout.steps * rollout.num_worlds // self.config.minibatches
             if rows < 1:
@@ -177,7 +177,7 @@ class PPO:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` gave."""
+        """Restore the result of :meth:`state_dict`."""
         load_optimiser_state(self.actor_optimiser, state["actor_optimiser"])
         load_optimiser_state(self.critic_optimiser, state["critic_optimiser"])
 
@@ -201,7 +201,7 @@ class AsymmetricPPO:
         self.ppo = PPO(self.agent, config, group)
 
     def prepare(self, env: VectorTask, samples: float) -> int:
-        """Storage for these worlds, the steps of ``algo.later_steps``, and the networks' number format."""
+        """Allocate storage for these worlds, apply ``algo.later_steps``, and choose the networks' number format."""
         steps, old = self.config.steps_at(samples), self.rollout
         self.agent.choose_dtype()
         fits = old is not None and old.env is env and old.steps == steps
@@ -215,7 +215,7 @@ class AsymmetricPPO:
         return self.rollout
 
     def begin(self) -> None:
-        """Freeze the policy's standard deviation; note what the normalisers have seen."""
+        """Freeze the policy's standard deviation; copy the normalisers' moments."""
         self._moments = [norm.moments() for norm in self._norms()]
         self._stored.begin()
 
@@ -241,7 +241,7 @@ class AsymmetricPPO:
         return self.agent.policy_norm, self.agent.critic_norm
 
     def weights_loaded(self, new_run: bool) -> None:
-        """A new run begins with its own standard deviation."""
+        """A new run begins with the standard deviation of its configuration."""
         if new_run:
             self.agent.actor.bound_std(self.config.std_floor, self.config.std[0].value)
         self.agent.choose_dtype()
@@ -259,7 +259,7 @@ class AsymmetricPPO:
         return self.ppo.state_dict()
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` gave."""
+        """Restore the result of :meth:`state_dict`."""
         self.ppo.load_state_dict(state)
 
     @staticmethod

@@ -1,4 +1,4 @@
-"""Rates of a rollout, from the sums that the worlds keep."""
+"""Rates of a rollout, from the sums over the worlds."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ COUNTS = ("serves", "hits", "successes", "falls", "episodes", "steps", "reward_s
 
 
 def summarise(statistics: dict[str, Tensor], control_dt: float, group: ProcessGroup | None = None) -> dict[str, float]:
-    """Rates of the last rollout from the environments' sums over the ``group``; NaN where nothing was counted.
+    """Rates of the last rollout from the environments' sums over the ``group``; NaN if nothing was counted.
 
     ``hit_rate`` and ``success_rate`` are shares of the serves that ended, ``fall_rate`` is falls per second of a
     world's time, rewards are means per control step, and every other sum is given per serve.

@@ -1,4 +1,4 @@
-"""Where serves and robots start: samplers over N worlds."""
+"""Initial states of serves and robots: samplers over N worlds."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def turn(yaw: wp.array[wp.float32], qpos: wp.array2d[wp.float32]):
 
 
 class ServeSampler:
-    """Draws where serves start and how fast they are."""
+    """Samples the initial position, velocity and spin of serves."""
 
     def __init__(
         self, config: ServeConfig, num_worlds: int, generator: torch.Generator, device: torch.device | str
@@ -36,14 +36,14 @@ class ServeSampler:
     def sample(self, mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Position m, velocity m/s and spin rad/s, each (N, 3), world frame: new in the worlds of ``mask`` (N,) bool.
 
-        The tensors are the same ones each time.
+        The tensors are allocated once and updated in place.
         """
         self._sample(mask)
         return self._launch
 
 
 class HeadStart:
-    """Puts balls that are being served somewhere further on their way, by a time drawn from ``config.head_start``."""
+    """Moves served balls forward on their flight, by a time sampled from ``config.head_start``."""
 
     def __init__(self, config: ServeConfig, ball: BallSim, generator: torch.Generator) -> None:
         duration = torch.zeros(ball.num_worlds, device=ball.device)
@@ -51,13 +51,13 @@ class HeadStart:
         self._skip = ball.skipper(duration)
 
     def give(self, mask: Tensor) -> None:
-        """Another time for each world of ``mask`` (N,) bool; its ball moves on by that."""
+        """Sample a time for each world of ``mask`` (N,) bool and move its ball forward by it."""
         self._sample(mask)
         self._skip(mask)
 
 
 class PoseSampler:
-    """Draws the state in which a robot starts an episode."""
+    """Samples the state in which a robot starts an episode."""
 
     def __init__(
         self,
@@ -86,7 +86,7 @@ class PoseSampler:
     def sample(self, mask: Tensor) -> tuple[Tensor, Tensor]:
         """qpos (N, 7 + J) and qvel (N, 6 + J) of MuJoCo; joints within their limits and at rest.
 
-        New in the worlds of ``mask`` (N,) bool; the tensors are the same ones each time.
+        New in the worlds of ``mask`` (N,) bool; the tensors are allocated once and updated in place.
         """
         self._sample(mask)
         self._turn()

@@ -1,4 +1,4 @@
-"""``python -m pace.viewer RUN``: watch a policy, on a live page or in a film; the same as ``pace play``."""
+"""``python -m pace.viewer RUN``: watch a policy, on a live page or in a video; the same as ``pace play``."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def main() -> int:
 
 
 def load() -> Work:
-    """What the command does, and the errors that it may end with."""
+    """The command's function and the errors that it may end with."""
     from pace.runs.checkpoint import CheckpointError
     from pace.sim.render import RenderError
     from pace.viewer.play import play_from_config
