@@ -1,6 +1,6 @@
-"""Per-world draws of robot, motor, ball, air and contact parameters, and of pushes.
+"""Per-world random parameters of robot, motor, ball, air and contact, and random pushes.
 
-Draws are made where a mask says so, on the device (:mod:`pace.arrays.draws`), so that a reset never waits for the host.
+The worlds of a mask are resampled on the device (:mod:`pace.arrays.draws`), so that a reset never waits for the host.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pace.config.sim import BallConfig, RandomizationConfig
 from pace.sim.ball.ball import BallParams
 from pace.sim.engine.base import EngineParams
 
-#: Engine parameters that are drawn straight from the range of the same name.
+#: Engine parameters that are sampled directly from the range of the same name.
 SAMPLED_ENGINE_PARAMS = (
     "friction",
     "trunk_mass",
@@ -27,7 +27,7 @@ SAMPLED_ENGINE_PARAMS = (
     "armature_scale",
     "effort_scale",
 )
-#: Ball parameter -> (range, whether the draw scales the nominal value or is added to it).
+#: Ball parameter -> (range, whether the sample scales the nominal value or is added to it).
 SAMPLED_BALL_PARAMS = {
     "mass": ("ball_mass_scale", True),
     "drag_coefficient": ("drag_scale", True),
@@ -50,7 +50,7 @@ def _push(
     until_push: wp.array[wp.float32],
     push: wp.array2d[wp.float32],
 ):
-    """One world's time to its next push, s, and the push (x, y) that is due, m/s; zero where none is."""
+    """One world's time to its next push, s, and the current push (x, y), m/s; zero if none is due."""
     world = wp.tid()
     left = until_push[world] - control_dt
     x, y = 0.0, 0.0
@@ -65,7 +65,7 @@ def _push(
 
 
 class Randomizer(Stateful):
-    """Draws the parameters of N worlds at reset, and the pushes in between.
+    """Samples the parameters of N worlds at reset, and the pushes in between.
 
     Attributes: ``actuator_delay`` (N,) s; ``push`` (N, nv) velocity to add to the generalized velocity before the
     next control step (m/s on the base's x and y, zero elsewhere).
@@ -101,7 +101,7 @@ class Randomizer(Stateful):
         self.sample(torch.ones(num_worlds, dtype=torch.bool, device=device))
 
     def _columns(self) -> list[Column]:
-        """What :meth:`sample` draws: where it is kept, its range and its limits."""
+        """The numbers that :meth:`sample` samples: storage, range and limits."""
         robot = {name: getattr(self._engine_params, name) for name in SAMPLED_ENGINE_PARAMS}
         robot |= {"actuator_delay": self.actuator_delay, "push_interval": self._until_push}
         columns = []
@@ -116,17 +116,17 @@ class Randomizer(Stateful):
         return columns
 
     def sample(self, mask: Tensor) -> None:
-        """Draw new parameters for the worlds of ``mask`` (N,) bool."""
+        """Resample the parameters of the worlds of ``mask`` (N,) bool."""
         self._sample(mask)
 
     def update_push(self) -> Tensor:
-        """Advance the push timers by one control step; return ``push`` (N, nv), zero where no push is due."""
+        """Step the push timers by one control step; return ``push`` (N, nv), zero if no push is due."""
         self._seed.random_(generator=self._generator)
         self._advance_push()
         return self.push
 
     def state_tensors(self) -> dict[str, Tensor]:
-        """Everything that was drawn, for an exact resume."""
+        """All samples, for an exact resume."""
         engine = with_prefix("engine", tensors_named(self._engine_params, SAMPLED_ENGINE_PARAMS))
         ball = with_prefix("ball", tensors_named(self._ball_params, tuple(SAMPLED_BALL_PARAMS)))
         return engine | ball | {"actuator_delay": self.actuator_delay, "until_push": self._until_push}
