@@ -1,6 +1,6 @@
 """PACE: humanoid table tennis by predictor-aided reinforcement learning, on MuJoCo Warp and TorchRL.
 
-``pace.make_env`` and ``pace.load_policy`` are where a notebook begins; ``python -m pace`` lists the commands.
+A notebook begins with ``pace.make_env`` and ``pace.load_policy``; ``python -m pace`` lists the commands.
 """
 
 from __future__ import annotations

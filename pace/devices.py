@@ -1,4 +1,4 @@
-"""What this machine has: its GPU, and its cores."""
+"""The GPU and the cores of this machine."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pace.config.base import ConfigError
 def resolve_device(device: str | torch.device) -> torch.device:
     """``auto``, ``cpu``, ``cuda`` or ``cuda:1`` as a torch device; ``auto`` is the first GPU, or the CPU without one.
 
-    Errors: :class:`ConfigError` for a device that is unknown, or not there.
+    Errors: :class:`ConfigError` for a device that is unknown or missing.
     """
     if str(device) == "auto":
         return torch.device("cuda:0" if torch.cuda.is_available() else "cpu")
@@ -31,7 +31,7 @@ def resolve_device(device: str | torch.device) -> torch.device:
 
 
 def usable_cores() -> int:
-    """Cores that this process may use: a job's share of a machine where the system tells, or all of them."""
+    """Cores that this process may use: a job's share of a machine if the system tells, else all of them."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

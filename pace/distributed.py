@@ -1,8 +1,8 @@
-"""Several processes that train one policy together: who they are, and what they average, add up and gather.
+"""The process group that trains one policy: its ranks and its collective operations.
 
-Each process plays worlds of its own and holds the same networks. What they learn from is averaged over them, so their
-weights stay equal, bit for bit. Processes are either started by :func:`team_of` on this machine, or by ``torchrun`` on
-one machine or several. torch.distributed carries it: gloo between CPUs, nccl between GPUs.
+Each process simulates separate worlds and holds the same networks. Gradients are averaged over the group, so the
+weights stay equal, bit for bit. Processes are started by :func:`process_group` on this machine, or by ``torchrun`` on
+one machine or several. Communication is torch.distributed: gloo between CPUs, nccl between GPUs.
 """
 
 from __future__ import annotations
@@ -28,44 +28,44 @@ T = TypeVar("T")
 
 WORLDS_PER_PROCESS = 256  # with fewer, the fixed cost of each operation outweighs what another process gains
 LOCAL_ADDRESS = "127.0.0.1"
-MEMBERSHIP = "PACE_TEAM"  # environment variable of a helper process: its rank, the team's size, the leader's port
-SECONDS_TO_END = 10.0  # for a helper whose leader is done
-LEADER_IS_GONE = 3  # exit status of a helper
+MEMBERSHIP = "PACE_PROCESS_GROUP"  # environment variable of a worker: its rank, the group's size, rank 0's port
+SECONDS_TO_END = 10.0  # for a worker after rank 0 is done
+RANK_0_IS_GONE = 3  # exit status of a worker
 SECONDS_TO_FAIL = 3.0  # between a lost connection and the end of the process behind it
 POLL_SECONDS = 0.05
-TAIL_LINES = 15  # of what a failed helper printed
+TAIL_LINES = 15  # of the output of a failed worker
 
 
-class TeamError(RuntimeError):
-    """A process of the team failed or cannot be reached; the message holds the end of what it printed."""
+class ProcessGroupError(RuntimeError):
+    """A process of the group failed or cannot be reached; the message holds the end of its output."""
 
 
-class Team:
-    """This process's place among ``size`` processes. A team of one does nothing, at no cost.
+class ProcessGroup:
+    """This process's rank among ``size`` processes. In a group of one, each collective method is free and does nothing.
 
-    Every collective method must be called by all processes of the team in the same order.
+    All processes of the group must call the collective methods in the same order.
     """
 
     def __init__(self, rank: int = 0, size: int = 1) -> None:
         self.rank, self.size = rank, size
 
     @property
-    def leads(self) -> bool:
-        """This process decides, prints and writes the files."""
+    def is_rank_0(self) -> bool:
+        """Whether this is rank 0, which decides, prints and writes the files."""
         return self.rank == 0
 
     def seed(self, seed: int) -> int:
-        """A seed of this process's own: ``seed`` itself for the leader, one drawn from both numbers for the others."""
-        if self.leads:
+        """A separate seed for each process: rank 0 keeps ``seed``, the others derive theirs from ``seed`` and rank."""
+        if self.is_rank_0:
             return seed
         return int(np.random.SeedSequence([seed, self.rank]).generate_state(1)[0])
 
-    def mean_(self, tensors: Sequence[Tensor]) -> None:
-        """Replace each float32 tensor by its mean over the team, all in one message."""
-        self.mean_later(tensors)()
+    def all_reduce_mean_(self, tensors: Sequence[Tensor]) -> None:
+        """Replace each float32 tensor by its mean over the group, all in one message."""
+        self.all_reduce_mean_later(tensors)()
 
-    def mean_later(self, tensors: Sequence[Tensor]) -> Callable[[], None]:
-        """Send ``tensors``; calling what is returned replaces each by its mean over the team."""
+    def all_reduce_mean_later(self, tensors: Sequence[Tensor]) -> Callable[[], None]:
+        """Send ``tensors``; calling the returned function replaces each by its mean over the group."""
         if self.size == 1:
             return lambda: None
         flat = torch.cat([tensor.reshape(-1) for tensor in tensors])
@@ -80,20 +80,20 @@ class Team:
 
         return finish
 
-    def sum_(self, tensor: Tensor) -> Tensor:
-        """Replace ``tensor`` by its sum over the team, and return it."""
+    def all_reduce_sum_(self, tensor: Tensor) -> Tensor:
+        """Replace ``tensor`` by its sum over the group, and return it."""
         if self.size > 1:
             dist.all_reduce(tensor)
         return tensor
 
-    def follow_(self, tensors: Sequence[Tensor]) -> None:
-        """Replace each tensor by the leader's."""
+    def broadcast_(self, tensors: Sequence[Tensor]) -> None:
+        """Replace each tensor by that of rank 0."""
         if self.size > 1:
             for tensor in tensors:
                 dist.broadcast(tensor, 0)
 
-    def decided(self, value: T) -> T:
-        """The leader's ``value``."""
+    def broadcast_object(self, value: T) -> T:
+        """The ``value`` of rank 0, on every process."""
         if self.size == 1:
             return value
         box = [value]
@@ -118,46 +118,46 @@ def suitable_size(num_worlds: int, device: torch.device) -> int:
 
 
 @contextmanager
-def team_of(size: int, device: torch.device, arguments: Sequence[str] | None = None) -> Iterator[Team]:
-    """The team of this process while the block runs: the one that it was started in, or a new one of ``size``.
+def process_group(size: int, device: torch.device, arguments: Sequence[str] | None = None) -> Iterator[ProcessGroup]:
+    """The process group while the block runs: the one that this process was started in, or a new one of ``size``.
 
-    A new team runs this very command, with its own or other ``arguments``, in ``size - 1`` helper processes, each on
-    its share of the cores. Errors: :class:`TeamError` when one of them fails, and for more than one on a GPU.
+    A new group runs the same command in ``size - 1`` worker processes, with the same or other ``arguments``, each on
+    its share of the cores. Errors: :class:`ProcessGroupError` when one of them fails, or if ``size`` > 1 on a GPU.
     """
     membership = os.environ.get(MEMBERSHIP)
     if size > 1 and device.type == "cuda" and not under_torchrun():
-        raise TeamError(
+        raise ProcessGroupError(
             f"{size} processes cannot share a GPU: torchrun --nproc-per-node={size} starts one for each GPU"
         )
     if membership:
-        Thread(target=_end_with_leader, daemon=True).start()
+        Thread(target=_end_with_rank_0, daemon=True).start()
         rank, size, port = (int(part) for part in membership.split())
         store = dist.TCPStore(LOCAL_ADDRESS, port, is_master=False)
         store.set(f"here/{rank}", "")
         with _connected(device, store=store, rank=rank, world_size=size):
-            yield Team(rank, size)
+            yield ProcessGroup(rank, size)
     elif under_torchrun():
         with _connected(device):
-            yield Team(dist.get_rank(), dist.get_world_size())
+            yield ProcessGroup(dist.get_rank(), dist.get_world_size())
     elif size == 1:
-        yield Team()
+        yield ProcessGroup()
     else:
         threads = threads_of(size)
         torch.set_num_threads(threads)
         store = dist.TCPStore(LOCAL_ADDRESS, 0, is_master=True, wait_for_workers=False)
-        with _Helpers(size, store.port, threads, sys.argv[1:] if arguments is None else arguments) as helpers:
-            helpers.wait_for(store)
-            with _connected(device, store=store, rank=0, world_size=size), helpers.explaining():
-                yield Team(0, size)
+        with _Workers(size, store.port, threads, sys.argv[1:] if arguments is None else arguments) as workers:
+            workers.wait_for(store)
+            with _connected(device, store=store, rank=0, world_size=size), workers.explaining():
+                yield ProcessGroup(0, size)
 
 
 def under_torchrun() -> bool:
-    """Whether ``torchrun`` started this process; it then says how many there are."""
+    """Whether ``torchrun`` started this process; it then sets the size of the group."""
     return "TORCHELASTIC_RUN_ID" in os.environ
 
 
 def own_device(device: str) -> str:
-    """``device``; under ``torchrun``, for ``cuda`` and ``auto``, the GPU of this process's number on its machine."""
+    """``device``; under ``torchrun``, for ``cuda`` and ``auto``, the GPU of this process's local rank."""
     if under_torchrun() and device in ("auto", "cuda") and torch.cuda.is_available():
         return f"cuda:{os.environ['LOCAL_RANK']}"
     return device
@@ -175,8 +175,8 @@ def _connected(device: torch.device, **place: Any) -> Iterator[None]:
         dist.destroy_process_group()
 
 
-class _Helpers:
-    """The other processes of a team that this one leads. They end with the block; what they print goes to a file."""
+class _Workers:
+    """The other ranks, started by rank 0. They end with the block; their output goes to a file."""
 
     def __init__(self, size: int, port: int, threads: int, arguments: Sequence[str]) -> None:
         self._open = ExitStack()
@@ -188,7 +188,7 @@ class _Helpers:
             environment = {MEMBERSHIP: f"{rank} {size} {port}", "OMP_NUM_THREADS": str(threads)}
             self._started[rank] = _start(arguments, log, environment)
 
-    def __enter__(self) -> _Helpers:
+    def __enter__(self) -> _Workers:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
@@ -201,7 +201,7 @@ class _Helpers:
         self._open.close()
 
     def wait_for(self, store: dist.Store) -> None:
-        """Return when all have arrived at ``store``."""
+        """Return when all have connected to ``store``."""
         for rank in self._started:
             while not store.check([f"here/{rank}"]):
                 self._require_none_failed(0.0)
@@ -209,7 +209,7 @@ class _Helpers:
 
     @contextmanager
     def explaining(self) -> Iterator[None]:
-        """Turn an error of torch.distributed into a :class:`TeamError` where a helper that failed is its cause."""
+        """Turn an error of torch.distributed into a :class:`ProcessGroupError` if a failed worker caused it."""
         try:
             yield
         except RuntimeError as error:
@@ -218,7 +218,7 @@ class _Helpers:
             raise
 
     def _require_none_failed(self, patience: float, cause: Exception | None = None) -> None:
-        """Errors: :class:`TeamError` when a helper has ended, or ends within ``patience`` seconds."""
+        """Errors: :class:`ProcessGroupError` when a worker has ended, or ends within ``patience`` seconds."""
         deadline = time.monotonic() + patience
         while True:
             for rank, process in self._started.items():
@@ -226,20 +226,20 @@ class _Helpers:
                     self._logs[rank].seek(0)
                     tail = "\n".join(self._logs[rank].read().splitlines()[-TAIL_LINES:])
                     status = f"process {rank} of {len(self._started) + 1} ended with status {process.returncode}"
-                    raise TeamError(f"{status}:\n{tail}") from cause
+                    raise ProcessGroupError(f"{status}:\n{tail}") from cause
             if time.monotonic() >= deadline:
                 return
             time.sleep(POLL_SECONDS)
 
 
-def _end_with_leader() -> None:
-    """In a helper: wait for the end of the leader, however it comes, and end with it."""
-    sys.stdin.buffer.read()  # it writes nothing; its end of the pipe closes with it
-    os._exit(LEADER_IS_GONE)
+def _end_with_rank_0() -> None:
+    """In a worker: wait until rank 0 ends, for whatever reason, and end too."""
+    sys.stdin.buffer.read()  # rank 0 writes nothing; its end of the pipe closes when it ends
+    os._exit(RANK_0_IS_GONE)
 
 
 def _start(arguments: Sequence[str], log: IO[str], environment: dict[str, str]) -> subprocess.Popen[str]:
-    """This command once more. A group of its own keeps the terminal's Ctrl-C from it: the leader ends the run."""
+    """Start this command again in its own process group: Ctrl-C then reaches only rank 0, which ends the run."""
     module = sys.modules["__main__"].__spec__
     program = ["-m", module.name] if module else [sys.argv[0]]
     return subprocess.Popen(

@@ -19,14 +19,14 @@ from torch import Tensor
 
 from pace.config.base import ConfigError
 from pace.config.training import load_train_config
-from pace.distributed import Team, TeamError, own_device, suitable_size, team_of
+from pace.distributed import ProcessGroup, ProcessGroupError, own_device, process_group, suitable_size
 from pace.predictor.network import PredictorNetwork
 from pace.predictor.regression import PredictorTrainer
 from pace.rl.agent import Agent, RunningNorm
 from pace.rl.ppo import PPO
 from pace.rl.rates import summarise
 from pace.rl.rollout import Rollout
-from pace.rl.trainer import Trainer, begins_anew
+from pace.rl.trainer import Trainer, restarts_worlds
 from pace.runs.checkpoint import flatten_tensors, load_checkpoint
 from pace.runs.metrics import read_metrics
 from tests.helpers.algo import CPU, small_algo
@@ -35,8 +35,8 @@ from tests.helpers.dummy import DummyTask
 STEPS, WORLDS = 6, 32
 
 
-class ThreadTeam(Team):
-    """A team of threads of this process, with the arithmetic of the real one; one at a time works, the others wait."""
+class ThreadGroup(ProcessGroup):
+    """A process group of threads, with the arithmetic of the real one; one at a time works, the others wait."""
 
     def __init__(self, rank: int, board: list[Any], barrier: threading.Barrier, turn: threading.Lock) -> None:
         super().__init__(rank, len(board))
@@ -56,7 +56,7 @@ class ThreadTeam(Team):
         finally:
             self.turn.acquire()
 
-    def mean_later(self, tensors: Sequence[Tensor]) -> Callable[[], None]:
+    def all_reduce_mean_later(self, tensors: Sequence[Tensor]) -> Callable[[], None]:
         everyone = self.gather([tensor.clone() for tensor in tensors])
 
         def finish() -> None:
@@ -65,23 +65,23 @@ class ThreadTeam(Team):
 
         return finish
 
-    def sum_(self, tensor: Tensor) -> Tensor:
+    def all_reduce_sum_(self, tensor: Tensor) -> Tensor:
         return tensor.copy_(torch.stack(self.gather(tensor.clone())).sum(0))
 
-    def follow_(self, tensors: Sequence[Tensor]) -> None:
+    def broadcast_(self, tensors: Sequence[Tensor]) -> None:
         first = self.gather([tensor.clone() for tensor in tensors])[0]
         for tensor, theirs in zip(tensors, first, strict=True):
             tensor.copy_(theirs)
 
 
-def together(work: Callable[[Team], Any], size: int = 2) -> list[Any]:
-    """``work`` of each member of a team of threads, in the order of ranks."""
+def together(work: Callable[[ProcessGroup], Any], size: int = 2) -> list[Any]:
+    """``work`` of each member of a process group of threads, in the order of ranks."""
     board, barrier, turn = [None] * size, threading.Barrier(size), threading.Lock()
 
     def run(rank: int) -> Any:
         try:
             with turn:
-                return work(ThreadTeam(rank, board, barrier, turn))
+                return work(ThreadGroup(rank, board, barrier, turn))
         except BaseException:
             barrier.abort()  # or the others would wait for this one for ever
             raise
@@ -118,13 +118,13 @@ def filled_rollout(agent: Agent, worlds: slice) -> Rollout:
 
 
 def test_two_halves_learn_what_the_whole_does() -> None:
-    def learn(agent: Agent, worlds: slice, team: Team) -> dict[str, float]:
-        return PPO(agent, small_algo(epochs=1, minibatches=1), team).update(filled_rollout(agent, worlds), 0.0)
+    def learn(agent: Agent, worlds: slice, group: ProcessGroup) -> dict[str, float]:
+        return PPO(agent, small_algo(epochs=1, minibatches=1), group).update(filled_rollout(agent, worlds), 0.0)
 
     whole, halves = agent_of(), (agent_of(), agent_of())
-    metrics = learn(whole, slice(0, WORLDS), Team())
+    metrics = learn(whole, slice(0, WORLDS), ProcessGroup())
     parts = (slice(0, WORLDS // 2), slice(WORLDS // 2, WORLDS))
-    half_metrics = together(lambda team: learn(halves[team.rank], parts[team.rank], team))
+    half_metrics = together(lambda group: learn(halves[group.rank], parts[group.rank], group))
     assert half_metrics[0] == half_metrics[1]
     of_parts = {"explained_variance": metrics["explained_variance"]}  # a share of variance, which is each part's own
     assert half_metrics[0] | of_parts == pytest.approx(metrics, rel=1e-4, abs=1e-6)
@@ -139,12 +139,12 @@ def test_moments_are_those_of_all_observations() -> None:
     generator = torch.Generator().manual_seed(1)
     first, second, third = (5.0 + 3.0 * torch.randn(count, 4, generator=generator) for count in (40, 30, 50))
 
-    def play(team: Team) -> RunningNorm:
+    def play(group: ProcessGroup) -> RunningNorm:
         norm = RunningNorm(4, 8.0)
         norm.update(first)
         before = norm.moments()
-        norm.update((second, third)[team.rank])
-        norm.pool(before, team)
+        norm.update((second, third)[group.rank])
+        norm.pool(before, group)
         return norm
 
     everything = torch.cat((first, second, third)).double()
@@ -156,7 +156,7 @@ def test_moments_are_those_of_all_observations() -> None:
         torch.testing.assert_close(norm(first[0]), expected.float(), rtol=1e-4, atol=1e-5)
 
 
-def test_the_predictor_of_a_team_is_one_and_its_error_that_of_all_samples() -> None:
+def test_the_predictor_of_a_group_is_one_and_its_error_that_of_all_samples() -> None:
     config = load_train_config(["predictor.batches_per_update=3"]).predictor
 
     torch.manual_seed(4)
@@ -167,10 +167,10 @@ def test_the_predictor_of_a_team_is_one_and_its_error_that_of_all_samples() -> N
         error = networks[0](inputs.flatten(0, 2)) - targets.flatten(0, 2)
     expected = 100.0 * error[:, networks[0].slices["apex"]].square().sum(1).mean().sqrt()
 
-    def fit(team: Team) -> dict[str, float]:
-        trainer = PredictorTrainer(networks[team.rank], config, STEPS, 16, team)
-        trainer.inputs.copy_(inputs[team.rank])
-        trainer.targets.copy_(targets[team.rank])
+    def fit(group: ProcessGroup) -> dict[str, float]:
+        trainer = PredictorTrainer(networks[group.rank], config, STEPS, 16, group)
+        trainer.inputs.copy_(inputs[group.rank])
+        trainer.targets.copy_(targets[group.rank])
         trainer.valid.fill_(True)
         return trainer.update()
 
@@ -183,10 +183,10 @@ def test_the_predictor_of_a_team_is_one_and_its_error_that_of_all_samples() -> N
 
 
 def test_rates_count_every_process() -> None:
-    def rates(team: Team) -> dict[str, float]:
+    def rates(group: ProcessGroup) -> dict[str, float]:
         counts = {"serves": (4.0, 12.0), "hits": (4.0, 0.0), "successes": (1.0, 1.0), "falls": (0.0, 2.0)}
         rest = {"steps": (50.0, 50.0), "episodes": (1.0, 2.0), "reward_sum": (5.0, 15.0)}
-        return summarise({name: torch.tensor(v[team.rank]) for name, v in (counts | rest).items()}, 0.02, team)
+        return summarise({name: torch.tensor(v[group.rank]) for name, v in (counts | rest).items()}, 0.02, group)
 
     for row in together(rates):
         assert row["hit_rate"] == 0.25
@@ -217,12 +217,12 @@ def test_each_process_of_torchrun_has_its_own_gpu(monkeypatch: pytest.MonkeyPatc
 
 
 def test_processes_of_this_machine_do_not_share_a_gpu() -> None:
-    with pytest.raises(TeamError, match="torchrun --nproc-per-node=2"), team_of(2, torch.device("cuda")):
+    with pytest.raises(ProcessGroupError, match="torchrun --nproc-per-node=2"), process_group(2, torch.device("cuda")):
         pass
 
 
-def test_seeds_differ_between_processes_and_the_leaders_is_its_own() -> None:
-    seeds = [Team(rank, 4).seed(seed) for seed in (1, 2) for rank in range(4)]
+def test_seeds_differ_between_processes_and_rank_0_keeps_the_configured_one() -> None:
+    seeds = [ProcessGroup(rank, 4).seed(seed) for seed in (1, 2) for rank in range(4)]
     assert len(set(seeds)) == 8
     assert seeds[0] == 1
     assert seeds[4] == 2
@@ -235,10 +235,10 @@ def test_another_number_of_processes_resumes_what_was_learned() -> None:
     saved = first.checkpoint()
     assert saved.training is not None
     played = saved.training["processes"]
-    assert not begins_anew(saved, Team(), CPU)
-    assert begins_anew(saved, Team(), torch.device("cuda"))
+    assert not restarts_worlds(saved, ProcessGroup(), CPU)
+    assert restarts_worlds(saved, ProcessGroup(), torch.device("cuda"))
     saved.training["processes"] = [{"env": "of worlds that are not these"}] * 2
-    assert begins_anew(saved, Team(), CPU)
+    assert restarts_worlds(saved, ProcessGroup(), CPU)
     second.resume(saved)
     saved.training["processes"] = [{"env": "of worlds on a GPU", "random_cuda": played[0]["random"]}]
     second.resume(saved)
@@ -287,7 +287,7 @@ def children_of(pid: int) -> list[int]:
     return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
-def test_two_processes_train_and_resume_exactly_and_one_goes_on_from_them(tmp_path: Path) -> None:
+def test_two_processes_train_and_resume_exactly_and_one_resumes_from_them(tmp_path: Path) -> None:
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     status, out, err = finish(start(f"out={whole}", f"samples={3 * UPDATE}", *SMALL))
     assert status == 0, err
@@ -304,18 +304,19 @@ def test_two_processes_train_and_resume_exactly_and_one_goes_on_from_them(tmp_pa
             assert torch.equal(tensor, resumed.weights[part][name]), f"{part} {name}"
     assert read_metrics(whole / "metrics.csv")["mean_reward"] == read_metrics(parts / "metrics.csv")["mean_reward"]
     first, second = (worlds["env"]["worlds.position"] for worlds in expected.training["processes"])  # type: ignore[index]
-    assert not torch.equal(first, second)  # each process plays worlds of its own
+    assert not torch.equal(first, second)  # each process simulates separate worlds
     status, out, err = finish(start(f"resume={parts}", f"samples={4 * UPDATE}", "progress=false", "processes=1"))
     assert status == 0, err
-    assert "update_00000003, with worlds that begin anew" in out
+    assert "resuming from" in out
+    assert "update_00000003, with new worlds" in out
     alone = load_checkpoint(parts)
     assert alone.counters["samples"] == 4 * UPDATE
     assert alone.weights["agent"]["policy_norm.count"].item() == 4 * UPDATE
     assert len(alone.training["processes"]) == 1  # type: ignore[index]
 
 
-def test_the_jobs_of_a_sweep_have_helpers_of_their_own(tmp_path: Path) -> None:
-    """Hydra's ``-m`` runs the command once for each value; a helper plays the task of its leader's job."""
+def test_the_jobs_of_a_sweep_have_separate_workers(tmp_path: Path) -> None:
+    """Hydra's ``-m`` runs the command once for each value; a worker simulates the task of its rank 0's job."""
     folder = f"out={tmp_path}/${{seed}}_${{sensing.name}}"
     status, _, err = finish(
         start("-m", "sensing=clean,wide", f"hydra.sweep.dir={tmp_path}", folder, f"samples={UPDATE}", *SMALL)
@@ -359,4 +360,4 @@ def test_ctrl_c_saves_and_a_lost_process_is_told(tmp_path: Path) -> None:
     deadline = time.monotonic() + 30.0
     while Path(f"/proc/{orphan}").exists() and time.monotonic() < deadline:
         time.sleep(0.05)
-    assert not Path(f"/proc/{orphan}").exists()  # a helper ends with its leader
+    assert not Path(f"/proc/{orphan}").exists()  # a worker ends with rank 0

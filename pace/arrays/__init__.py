@@ -1,11 +1,10 @@
-"""Torch tensors and Warp arrays on one memory: structs of arrays, launches by name, random draws, graphs, state.
+"""Torch tensors and Warp arrays on one memory: structs of arrays, launches by name, random samples, graphs, state.
 
-Here belongs what every kernel needs, whatever it computes; not the kernels of one subject. Imports ``config`` and
-``devices``."""
+Tools that every kernel needs belong here; the kernels of one subject do not. Imports ``config`` and ``devices``."""
 
 import warp as wp
 
-# Warp compiles each module once per setting, so both must stand before the first kernel is defined.
+# Warp compiles each module once per setting, so both must be set before the first kernel is defined.
 wp.config.enable_backward = False  # nothing here is differentiated; adjoint code doubles the compilation
 wp.config.log_level = wp.LOG_WARNING  # no banner and no line per module that is loaded
 wp.init()  # wp.device_from_torch does not do it by itself

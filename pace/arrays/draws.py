@@ -1,7 +1,7 @@
-"""Uniform draws for some of N worlds, made in a kernel: worlds that are not asked for cost nothing.
+"""Uniform samples for some of N worlds, made in one kernel: the other worlds cost nothing.
 
-Torch would draw for all N and keep few, in several operators for each quantity; a reset of a few worlds would then take
-as long as one of all.
+Torch would sample for all N and keep few, in several operators for each quantity. A reset of a few worlds would then
+take as long as a reset of all.
 """
 
 from collections.abc import Sequence
@@ -26,8 +26,8 @@ class ColumnArrays:
 
 
 @wp.kernel
-def _draw(mask: wp.array[wp.bool], seed: wp.array[wp.int32], columns: wp.array[ColumnArrays]):
-    """Draw all columns of one world."""
+def _sample(mask: wp.array[wp.bool], seed: wp.array[wp.int32], columns: wp.array[ColumnArrays]):
+    """Sample all columns of one world."""
     world = wp.tid()
     if not mask[world]:
         return
@@ -39,20 +39,20 @@ def _draw(mask: wp.array[wp.bool], seed: wp.array[wp.int32], columns: wp.array[C
 
 
 class Column(NamedTuple):
-    """Where one number of each world is kept, and what it is drawn from."""
+    """One number of each world: its storage and its range."""
 
     values: Tensor  # (N,) float32, of any stride
     low: float
     high: float
-    least: float = -float("inf")  # what is drawn is kept within these
+    least: float = -float("inf")  # the sample is clamped to these
     most: float = float("inf")
 
 
-class Draws:
-    """Draws columns of numbers anew where a mask says so; each call takes one number from the generator.
+class UniformSampler:
+    """Resamples columns of numbers in the worlds of a mask; each call takes one number from the generator.
 
     Args:
-        columns: what is drawn; their tensors are written in place.
+        columns: what is sampled; their tensors are written in place.
         generator: source of the kernel's seeds, on the columns' device.
     """
 
@@ -61,12 +61,12 @@ class Draws:
         num_worlds, device = columns[0].values.shape[0], columns[0].values.device
         self._seed = torch.zeros(1, dtype=torch.int32, device=device)
         rows = table(ColumnArrays, columns, device)
-        self._draw = MaskedLaunch(_draw, num_worlds, device, seed=self._seed, columns=rows)
+        self._sample = MaskedLaunch(_sample, num_worlds, device, seed=self._seed, columns=rows)
 
     def __call__(self, mask: Tensor) -> None:
-        """Draw for the worlds of ``mask`` (N,) bool; the others keep what they have."""
+        """Resample in the worlds of ``mask`` (N,) bool; the others keep their values."""
         self._seed.random_(generator=self._generator)
-        self._draw(mask)
+        self._sample(mask)
 
 
 def columns_of(values: Tensor, ranges: Sequence[Sequence[float]]) -> list[Column]:

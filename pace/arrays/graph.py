@@ -1,4 +1,4 @@
-"""Work that is the same in every step, launched as one: CUDA graphs on a GPU, Warp's own on its CPU device."""
+"""Work that repeats in every step, launched as one: CUDA graphs on a GPU, Warp's graphs on its CPU device."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ def graphs_wanted(engine: EngineConfig, device: torch.device) -> bool:
 
 
 class CapturedCall:
-    """A function of tensors that works in place, replayed as a CUDA graph where ``enabled``.
+    """A function of tensors that works in place, replayed as a CUDA graph if ``enabled``.
 
     The first call runs the function as it is, which compiles kernels and binds tensors; the second captures it; from
     then on a call copies its arguments into fixed tensors and launches the graph, without any of the function's Python.
-    So the function must do the same work on the same memory each time: no value that Python computes anew, no copy
-    from the host, nothing that waits. A call inside that of another :class:`CapturedCall` becomes part of the other.
+    So the function must do the same work on the same memory each time: no new value from Python, no copy from the
+    host, no wait. A call inside that of another :class:`CapturedCall` becomes part of the other.
 
     Args:
         function: what is called; it returns nothing.
         device: where all of it runs.
         enabled: off: every call is the function itself.
-        generator: the source of its random draws; each launch goes on where the last one ended, as without a graph.
+        generator: the source of its random numbers; each launch continues the sequence, as without a graph.
 
     Errors of the second call: ``RuntimeError`` for a function that cannot be captured.
     """
@@ -69,7 +69,7 @@ class CapturedCall:
             self._graph.replay()
 
     def _capture(self, inputs: tuple[Tensor, ...]) -> torch.cuda.CUDAGraph:
-        """The graph of one call. Nothing runs meanwhile, and Warp is told, for it allocates memory on the way."""
+        """The graph of one call. Nothing runs during the capture; Warp must know of it because it allocates memory."""
         graph = torch.cuda.CUDAGraph()
         if self._generator is not None:
             graph.register_generator_state(self._generator)
@@ -84,16 +84,16 @@ class CapturedCall:
             ):
                 self._function(*inputs)
         except RuntimeError as error:
-            raise RuntimeError(f"no CUDA graph of {self._function}; engine.graph=never does without") from error
+            raise RuntimeError(f"no CUDA graph of {self._function}; engine.graph=never runs without graphs") from error
         self._warp_graph = capture.graph
         return graph
 
 
 class RecordedLaunches:
-    """Launches on Warp's CPU device, repeated in C++ where ``enabled``: Python is a quarter of a step of 256 robots.
+    """Launches on Warp's CPU device, repeated in C++ if ``enabled``: Python is a quarter of a step of 256 robots.
 
-    As with :class:`CapturedCall` the first call runs the function, the second records it, and it must do the same each
-    time; here it launches kernels of Warp and does nothing else. A loop that ends on a condition stays one.
+    As with :class:`CapturedCall`, the first call runs the function and the second records it, and the function must do
+    the same each time. Here it may only launch Warp kernels. A loop that ends on a condition is recorded as such.
     """
 
     def __init__(self, function: Callable[[], None], enabled: bool) -> None:
@@ -115,7 +115,7 @@ class RecordedLaunches:
 
 @contextmanager
 def _as_one() -> Iterator[None]:
-    """Calls within are part of the call around them."""
+    """Nested calls become part of the outer call."""
     CapturedCall._running = True
     try:
         yield

@@ -1,4 +1,4 @@
-"""Launches by the names of a kernel's arguments, recorded once and replayed; again for other tensors."""
+"""Launches by the names of a kernel's arguments, recorded once and replayed; recorded again for other tensors."""
 
 from __future__ import annotations
 
@@ -24,13 +24,14 @@ class Launch:
     """A launch that is only replayed when called, on torch's current stream.
 
     Args:
-        kernel: what is launched.
-        dim: threads, for instance N for one a world.
+        kernel: the kernel to launch.
+        dim: threads, for instance N for one per world.
         device: of all tensors.
         arguments: by the names of the kernel's arguments, in any order. For an array: a tensor, whose memory is shared
-            (for vectors the last dimension holds their numbers), or a Warp array. For a struct: a Warp struct, or what
-            has its fields as attributes or keys, for instance a dataclass of tensors (:mod:`pace.arrays.tensors`). For
-            a vector: any sequence. All of it is kept alive, and read where it lies at each call.
+            (for vectors the last dimension holds their numbers), or a Warp array. For a struct: a Warp struct, or an
+            object with its fields as attributes or keys, for instance a dataclass of tensors
+            (:mod:`pace.arrays.tensors`). For a vector: any sequence. All are kept alive, and read in place at each
+            call.
 
     Errors: :class:`LaunchError` for a missing or unknown name, and for a tensor of another type, shape or device than
     the kernel declares.
@@ -78,11 +79,11 @@ class MaskedLaunch:
 
 
 class Bound(Generic[T]):
-    """What was made for the tensors that a caller gives, kept as long as they are the same, made again for others.
+    """An object made for the tensors that a caller gives: kept as long as they are the same, rebuilt for others.
 
     Args:
         make: makes it from the tensors, for instance a :class:`Launch` on them.
-        shapes: name -> shape of each of them, in their order; ``None``: no shape is asked for.
+        shapes: name -> shape of each of them, in their order; ``None``: any shape.
     """
 
     def __init__(self, make: Callable[..., T], **shapes: tuple[int, ...] | None) -> None:
@@ -91,7 +92,7 @@ class Bound(Generic[T]):
         self._given: tuple[Any, ...] = (None,) * len(shapes)
 
     def __call__(self, *given: Any) -> T:
-        """It, for these tensors. Give the same ones each time: others take longer.
+        """The object for these tensors. Give the same ones each time: a rebuild takes longer.
 
         Errors: ``ValueError`` that names a tensor of another shape.
         """
@@ -150,7 +151,7 @@ def _as_struct(where: str, struct: Any, owner: Any, device: torch.device) -> Any
 
 
 def table(struct: Any, rows: Iterable[Any], device: torch.device) -> wp.array:
-    """An array of Warp structs, each from what has its fields as attributes or keys. Keep the tensors in them alive.
+    """An array of Warp structs, each from an object with its fields as attributes or keys. Keep the tensors alive.
 
     Errors: :class:`LaunchError` as those of :class:`Launch`.
     """
@@ -173,11 +174,11 @@ def _as_array(where: str, declared: Any, tensor: Tensor, device: torch.device) -
     if tensor.device.type != device.type or (device.index is not None and tensor.device.index != device.index):
         raise LaunchError(f"{where} must lie on {device}, not on {tensor.device}")
     if inner and tensor.stride(-1) != 1:
-        raise LaunchError(f"{where} must hold the numbers of each vector side by side")
+        raise LaunchError(f"{where} must hold the numbers of each vector contiguously")
     return wp.from_torch(tensor, dtype=element)
 
 
 def require_shape(name: str, tensor: Tensor, shape: tuple[int, ...]) -> None:
-    """Kernels read by index, beyond the end of a tensor that is too small. Errors: ``ValueError`` that names it."""
+    """Check a shape, as kernels read beyond the end of a small tensor. Errors: ``ValueError`` that names it."""
     if tensor.shape != shape:
         raise ValueError(f"{name} must have shape {shape}, not {tuple(tensor.shape)}")

@@ -1,4 +1,4 @@
-"""What an object must remember to resume: tensors that it declares, as a dictionary to save and to put back."""
+"""State that an object needs to resume: declared tensors, as a dictionary to save and to load."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Stateful:
         return {name: tensor.clone() for name, tensor in self.state_tensors().items()}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Put back what :meth:`state_dict` returned, in place.
+        """Load the result of :meth:`state_dict`, in place.
 
         Errors: ``KeyError`` for a missing tensor, ``RuntimeError`` for another shape.
         """

@@ -1,4 +1,4 @@
-"""Torch's streams as Warp knows them, so that Warp's work keeps its place among torch's own."""
+"""Torch's streams as Warp objects, so that Warp's kernels run in order with torch's."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import warp as wp
 
 
 def torch_stream(device: torch.device) -> wp.Stream:
-    """Torch's current stream on a GPU. Warp's work given to it keeps its place among torch's own kernels.
+    """Torch's current stream on a GPU. Warp's kernels on it run in order with torch's.
 
     Warp's default stream waits for torch's default one and the other way round, but for no other stream of torch.
     """

@@ -1,8 +1,8 @@
 """Structs of arrays, declared once: a dataclass of tensors for torch, and the Warp struct that follows from it.
 
-A field's annotation says what a kernel finds in it: ``hit: Bool`` is one flag for each world, ``foot_force:
-Annotated[Vec3, "feet"]`` one vector for each foot of each world, ``InfFloat`` a number that begins infinite.
-A field may be such a dataclass itself.
+A field's annotation declares its elements: ``hit: Bool`` is one flag for each world, ``foot_force: Annotated[Vec3,
+"feet"]`` one vector for each foot of each world, ``InfFloat`` a number that begins infinite. A field may be such a
+dataclass itself.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Vec4 = Annotated[Tensor, wp.vec4]
 
 @dataclass(frozen=True)
 class Start:
-    """What the numbers of a field are when it is allocated; 0 if nothing is said."""
+    """The initial value of a field's numbers; 0 without it."""
 
     value: float
 

@@ -1,4 +1,4 @@
-"""The whole environment under random actions, in this process or shared by several."""
+"""The whole environment under random actions, in this process or split over several."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from pace.bench.training import BenchError
 from pace.config import plugins
 from pace.config.commands import BenchConfig
 from pace.devices import threads_of
-from pace.distributed import Team
+from pace.distributed import ProcessGroup
 from pace.predictor.network import make_predictor
 from pace.predictor.priors import resolve_priors
 from pace.task.env import TableTennisEnv
 
-FAILED = "a process of the environment's crew failed; what it said stands above"
+FAILED = "one of the environment's processes failed; its output stands above"
 
 
 class EnvironmentLoop:
@@ -31,14 +31,14 @@ class EnvironmentLoop:
         predictor = make_predictor(resolve_priors(config)).to(device)
         self.env = TableTennisEnv(config, config.num_worlds, device, config.seed, predictor)
         self.action = torch.zeros(config.num_worlds, self.env.action_spec.shape[-1], device=device)
-        self.draw()
+        self.sample()
 
-    def draw(self) -> None:
-        """New actions for every world."""
+    def sample(self) -> None:
+        """Sample new actions for every world."""
         self.action.normal_().mul_(self.action_std)
 
     def play(self, steps: int) -> None:
-        """Advance all worlds and reset those that are done, ``steps`` times."""
+        """Step all worlds and reset those that are done, ``steps`` times."""
         for _ in range(steps):
             self.env.advance(self.action)
             self.env.reset_worlds(self.env.terminated | self.env.truncated)
@@ -48,10 +48,10 @@ class EnvironmentLoop:
         self.play(self.control_steps)
 
 
-class EnvironmentCrew:
-    """The same loop, its worlds shared by ``size`` processes as those of a training run are.
+class EnvironmentProcesses:
+    """The same loop, its worlds split over ``size`` processes as in a training run.
 
-    They have settled when the constructor returns. Errors: :class:`BenchError` when one of them fails.
+    All have settled when the constructor returns. Errors: :class:`BenchError` when one of them fails.
     """
 
     def __init__(self, config: BenchConfig, engine: str, size: int) -> None:
@@ -62,7 +62,7 @@ class EnvironmentCrew:
         self._lines: list[Connection] = []
         self._processes = []
         for rank in range(size):
-            share.seed = Team(rank, size).seed(config.seed)
+            share.seed = ProcessGroup(rank, size).seed(config.seed)
             own, theirs = context.Pipe()
             process = context.Process(target=_serve, args=(theirs, share, engine, share.engine.threads), daemon=True)
             process.start()
@@ -87,7 +87,7 @@ class EnvironmentCrew:
         except EOFError:
             raise BenchError(FAILED) from None
 
-    def __enter__(self) -> EnvironmentCrew:
+    def __enter__(self) -> EnvironmentProcesses:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
@@ -98,14 +98,14 @@ class EnvironmentCrew:
 
 
 def _serve(line: Connection, config: BenchConfig, engine: str, threads: int) -> None:
-    """Settle, then play one repeat for each message, until the line is closed."""
+    """Settle, then run one repeat for each message, until the connection is closed."""
     torch.set_num_threads(threads)
-    plugins.use(config.plugins)  # this is another process than the one that was told
+    plugins.use(config.plugins)  # a spawned process does not inherit them
     loop = EnvironmentLoop(config, engine, torch.device("cpu"), config.bench.control_steps)
     loop.play(config.bench.settle_steps)
     try:
         while True:
-            loop.draw()
+            loop.sample()
             line.send(True)
             line.recv()
             loop.run()

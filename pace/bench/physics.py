@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pace.bench.environment import EnvironmentCrew, EnvironmentLoop
+from pace.bench.environment import EnvironmentLoop, EnvironmentProcesses
 from pace.bench.timing import median_seconds
 from pace.config.commands import BenchConfig
 from pace.distributed import suitable_size
@@ -74,12 +74,12 @@ def _native_rates(config: BenchConfig) -> dict[str, float]:
     loop.play(config.bench.settle_steps)
 
     def same_start() -> None:
-        loop.draw()
+        loop.sample()
         qpos, qvel = worlds.engine.qpos_path[:, -1], worlds.engine.qvel_path[:, -1]
         raw.start_from(qpos, qvel, worlds.nominal + config.robot.action_scale * loop.action)
 
-    with EnvironmentCrew(config, "native", suitable_size(config.num_worlds, cpu)) as crew:
-        measured = {"raw": raw.run, "native": crew.run, "one_process": loop.run}
+    with EnvironmentProcesses(config, "native", suitable_size(config.num_worlds, cpu)) as processes:
+        measured = {"raw": raw.run, "native": processes.run, "one_process": loop.run}
         seconds = median_seconds(measured, config.bench.repeats, cpu, same_start)
     samples = config.num_worlds * steps
     return {
@@ -95,5 +95,5 @@ def mjwarp_rates(config: BenchConfig, device: torch.device) -> dict[str, float]:
     loop = EnvironmentLoop(config, "mjwarp", device, steps)
     if device.type == "cuda":
         loop.play(config.bench.settle_steps)
-    seconds = median_seconds({"mjwarp": loop.run}, config.bench.repeats, device, loop.draw)
+    seconds = median_seconds({"mjwarp": loop.run}, config.bench.repeats, device, loop.sample)
     return {"mjwarp_env_steps_per_s": config.num_worlds * steps / seconds["mjwarp"]}

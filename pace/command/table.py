@@ -45,7 +45,7 @@ COMMANDS = {
     "train": Command(
         module="pace.rl.train",
         work="pace.rl.session:train_from_config",
-        failures=("pace.distributed:TeamError", "pace.rl.rollout:RolloutError", CHECKPOINT_ERROR),
+        failures=("pace.distributed:ProcessGroupError", "pace.rl.rollout:RolloutError", CHECKPOINT_ERROR),
         config="train",
         summary="train a policy and its predictor",
         about="Writes a run folder: configuration, versions, metrics, checkpoints and learning curve. Ctrl-C saves and "

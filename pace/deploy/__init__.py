@@ -1,5 +1,5 @@
-"""A policy for a robot: the graph of all that it computes, and its ONNX file.
+"""Exporting a policy for a robot: its whole computation as one graph, and the ONNX file.
 
-Here belongs what leaves this package as a file; not the steps that it computes (``onboard``). Imports ``rl`` and the
-rooms below. ``python -m pace.deploy RUN`` exports.
+The exported file belongs here; the estimators that it computes (``onboard``) do not. Imports ``rl`` and the rooms
+below. ``python -m pace.deploy RUN`` exports.
 """

@@ -1,7 +1,7 @@
-"""The policy as a robot runs it: ``step(readings, state) -> (targets, state)``, in one network.
+"""The deployed policy: ``step(readings, state) -> (targets, state)``, in one network.
 
-All that lies between the readings and the actor is :class:`pace.onboard.actor.Onboard`, which the environment runs too.
-What is remembered from call to call goes out as one tensor, ``state_next``, and comes back as ``state``.
+Everything between the readings and the actor is :class:`pace.onboard.actor.Onboard`, which the environment runs too.
+The memory between calls is one tensor: the output ``state_next`` is the next call's input ``state``.
 """
 
 from __future__ import annotations
@@ -56,9 +56,9 @@ def results(joints: int) -> dict[str, Port]:
     """Outputs (N, size) besides the state."""
     return {
         "joint_target": Port(joints, "rad", "targets of the joints' position control until the next call"),
-        "action": Port(joints, "1", "the same as the network gives it: relative to nominal_pose, in action_scale rad"),
-        "predicted_apex": Port(3, "m", "learned prediction, or the point to stand by while there is nothing to hit"),
-        "predicted_target": Port(3, "m", "where the paddle is to meet the ball, likewise"),
+        "action": Port(joints, "1", "the network's output: the same relative to nominal_pose, in action_scale rad"),
+        "predicted_apex": Port(3, "m", "learned prediction, or the idle point while there is nothing to hit"),
+        "predicted_target": Port(3, "m", "point at which the paddle should meet the ball, likewise"),
         "predicted_time": Port(1, "s", "until the ball is at the target; 0 while there is nothing to hit"),
         "something_to_hit": Port(1, "0 or 1", "the ball can still be hit, as far as the robot can know"),
     }
@@ -77,7 +77,7 @@ def output_ports(config: TaskConfig) -> dict[str, Port]:
 
 
 def state_parts(config: TaskConfig) -> dict[str, Part]:
-    """What the state holds, in the order of its columns."""
+    """Parts of the state, in the order of its columns."""
     observation, joints = config.observation, joints_of(config)
     frame = sum(width(POLICY[name].size, joints) for name in observation.policy)
     parts = {
@@ -94,13 +94,13 @@ def state_parts(config: TaskConfig) -> dict[str, Part]:
 
 
 class DeployedPolicy(nn.Module):
-    """Normaliser, predictor and actor, and all that lies between a robot's raw readings and them.
+    """Normaliser, predictor and actor, and the on-board estimators between a robot's raw readings and them.
 
     Inputs in the order of :func:`input_ports`, outputs in the order of :func:`output_ports`, each (N, size) float32.
 
     Args: policy as :func:`pace.rl.load_policy` gives it; model of the robot, for the paddle's kinematics.
-    Errors: ``TypeError`` for a built-in policy, which is no network; :class:`pace.config.ConfigError` for observations
-    that nobody computes.
+    Errors: ``TypeError`` for a built-in policy, which is no network; :class:`pace.config.ConfigError` for unknown
+    observations.
     """
 
     nominal: Tensor
@@ -162,7 +162,7 @@ class DeployedPolicy(nn.Module):
 
 
 class StateLayout:
-    """Where in the state (N, ``size``) each part is: those of :func:`state_parts`, an estimate's as one.
+    """Columns of each part in the state (N, ``size``): those of :func:`state_parts`, an estimate's as one.
 
     Attributes: ``columns`` part or estimate -> columns.
     """

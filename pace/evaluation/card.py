@@ -1,4 +1,4 @@
-"""The card of a kept policy: what it is, how it was trained, how well it plays and how to play it, as Markdown."""
+"""The model card of a published policy: its task, training, results and commands, as Markdown."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from pace.runs.checkpoint import load_checkpoint
 CARD = "README.md"
 EVALUATION, SWEEP, VERSIONS = "evaluation.json", "sweep.json", "versions.json"
 GROUPS = ("robot", "ball", "serve", "randomization", "sensing", "observation", "reward", "predictor", "algo")
-#: Of the machine that played, not of what was played.
+#: Keys of the machine, not of the task.
 MACHINE = ("engine.threads=", "engine.graph=", "engine.physics_dt=")
 
 
 def card(folder: Path, notes: str = "") -> str:
-    """The card of the policy in ``folder``, from the files that lie there; ``notes`` stand below its first table."""
+    """The model card of the policy in ``folder``, from the files there; ``notes`` stand below its first table."""
     parts = [f"# {folder.name}", _facts(folder, _read(folder / VERSIONS)), notes.strip()]
     evaluation, sweep = _read(folder / EVALUATION), _read(folder / SWEEP)
     parts += [_evaluation(folder, evaluation)] if evaluation.get("rows") else []
@@ -57,7 +57,7 @@ def _evaluation(folder: Path, found: Mapping[str, Any]) -> str:
     table = markdown_table(
         ("serves", "number", "hit %", "success %", "falls per 1,000"), [_row(row) for row in found["rows"]]
     )
-    return f"## How well it plays\n\n`{command}`\n\n{table}"
+    return f"## Evaluation\n\n`{command}`\n\n{table}"
 
 
 def _sweep(found: Mapping[str, Any]) -> str:
@@ -67,7 +67,7 @@ def _sweep(found: Mapping[str, Any]) -> str:
         for row in cell["rows"]
     ]
     head = ("change", "serves", "number", "hit %", "success %", "falls per 1,000")
-    return f"## What it survives\n\n{markdown_table(head, rows)}"
+    return f"## Robustness sweep\n\n{markdown_table(head, rows)}"
 
 
 def _row(row: Mapping[str, Any]) -> Sequence[str]:

@@ -34,11 +34,11 @@ from pace.rl.policies import TaskPolicy, built_in_policy, load_policy
 from pace.runs.progress import SECONDS_PER_LINE, clock
 from pace.runs.run_folder import default_folder, versions
 
-TASK_PARTS = ("robot", "ball", "engine", "randomization", "sensing")  # what the report says of the task
+TASK_PARTS = ("robot", "ball", "engine", "randomization", "sensing")  # parts of the task in the report
 
 
 def evaluate_from_config(composed: DictConfig) -> None:
-    """Evaluate as the composed configuration says, and print what was measured and written."""
+    """Evaluate as configured, and print the results and the files."""
     config = parse(composed, EvaluateConfig)
     policy = choose_policy(config)
     overrides = [f"engine.physics_dt={config.physics_dt}", *config.overrides]
@@ -55,7 +55,7 @@ def evaluate_from_config(composed: DictConfig) -> None:
 
 
 def changes(config: EvaluateConfig, task: TrainConfig) -> list[Variation]:
-    """What the sweep changes, if there is one."""
+    """The changes of the sweep, if there is one."""
     return variations(task, config.variations) if config.sweep else []
 
 
@@ -82,16 +82,16 @@ def choose_policy(config: EvaluateConfig) -> TaskPolicy:
     """The policy that ``config`` names: a saved one, or a built-in on the saved or the default task."""
     saved = load_policy(config.run) if config.run else None
     if config.policy == "run":
-        assert saved is not None  # EvaluateConfig has seen to it
+        assert saved is not None  # guaranteed by EvaluateConfig
         return saved
     return built_in_policy(config.policy, config.seed, saved, config.device)
 
 
 def circumstances(config: EvaluateConfig, policy: TaskPolicy, overrides: Sequence[str]) -> dict[str, Any]:
-    """What the figures depend on, for the report.
+    """The settings that the numbers depend on, for the report.
 
     Errors: :class:`pace.config.ConfigError` for an unknown serve range and a physics step that does not divide the
-    control step, so that they come before hours of play.
+    control step, before hours of simulation.
     """
     for name in (*config.rows, *(config.sweep_rows if config.sweep else ())):
         override_task(policy.config, [f"serve={name}"])
@@ -125,7 +125,7 @@ def run_sweep(
 ) -> list[Path]:
     """Play those ``cells`` that are not ``finished``; the files in ``folder`` are up to date after each.
 
-    A change that changes nothing is not played again. Returns the files.
+    A change without effect is not played again. Returns the files.
     """
     open_cells = cells_to_play(cells, finished)
     print(f"\nsweep: {len(cells)} cells, {len(open_cells)} to play; finished ones go to {folder}", flush=True)
@@ -136,7 +136,7 @@ def run_sweep(
             finished[cell.key] = play_cell(config, policy, cell)
             files = write_sweep(folder, cells, finished, context)
         except KeyboardInterrupt:
-            print(f"\nto go on: the same command with rows=[] out={folder}", file=sys.stderr)
+            print(f"\nto resume: the same command with rows=[] out={folder}", file=sys.stderr)
             raise
         done += cell.cost
         left = clock((time.monotonic() - started) * (total - done) / done)
@@ -156,7 +156,7 @@ def play_cell(config: EvaluateConfig, policy: TaskPolicy, cell: Cell) -> list[di
 
 
 def cell_text(cell: Cell, rows: Sequence[Mapping[str, Any]]) -> str:
-    """A finished cell in a line."""
+    """A finished cell in one line."""
     shares = (f"{row['serve']} {100 * row['hit']:.0f}/{100 * row['success']:.0f}" for row in rows)
     return f"{cell.variation.label}: hit/success % {', '.join(shares)} ({rows[0]['serves']:,} serves a row)"
 

@@ -1,4 +1,4 @@
-"""Figures of an evaluation: where the paddle met the ball, where returns landed, how the base moved, what survives."""
+"""Figures of an evaluation: strike points, landing points, paths of the base, and the robustness sweep."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SPEED_CLASSES = (
     ("mid-long, 5.7 to 6.2 m/s", -6.2, -5.7, "tab:orange"),
     ("short, 5.2 to 5.7 m/s", -5.7, -5.2, "tab:blue"),
 )
-DOTS_PER_CLASS = 1500  # more would only cover each other
+DOTS_PER_CLASS = 1500  # more would overlap
 LANDING_COLOURS = {
     Outcome.SUCCESS: "tab:green",
     Outcome.OUT: "tab:red",
@@ -37,13 +37,13 @@ AREA_X, AREA_Y, HEIGHTS = (-2.6, -1.2), (-1.15, 1.15), (0.4, 1.6)  # m, the robo
 STRIKE_LEGEND = "speed of the serve (successes); hollow: hit without success; light blue, black: table"
 LANDING_X, LANDING_Y = (-1.6, 3.2), (-1.6, 1.6)  # m
 TABLE_COLOUR = "#c9dcec"
-DARK = 42.0  # per cent from the middle of the heat map: black letters cannot be read on it
+DARK = 42.0  # per cent from the middle of the heat map: black letters are unreadable beyond it
 DPI = 120
 
 
 def new_figure(width: float, height: float) -> Figure:
     """A figure without a window."""
-    from matplotlib.figure import Figure  # takes a second that no evaluation should wait for
+    from matplotlib.figure import Figure  # slow to import
 
     return Figure(figsize=(width, height), layout="constrained")
 
@@ -64,7 +64,7 @@ def thinned(records: Tensor, most: int) -> Tensor:
 
 
 def strike_map(rows: Sequence[Row], table: TableConfig) -> Figure:
-    """Where the paddle met the ball in successful returns, from above and from the side, by speed of the serve.
+    """Strike points of successful returns, from above and from the side, by speed of the serve.
 
     Figure 5 of the paper; hits without success are hollow.
     """
@@ -96,7 +96,7 @@ def strike_map(rows: Sequence[Row], table: TableConfig) -> Figure:
 
 
 def landing_map(rows: Sequence[Row], table: TableConfig, target: tuple[float, float]) -> Figure:
-    """Where returns came down, on the table seen from above."""
+    """Landing points of returns, on the table seen from above."""
     figure = new_figure(9.0, 7.3)
     axes = figure.subplots()
     records = all_records(rows)
@@ -123,7 +123,7 @@ def landing_map(rows: Sequence[Row], table: TableConfig, target: tuple[float, fl
 
 
 def _beyond(records: Tensor) -> int:
-    """Returns that came down outside of the landing map."""
+    """Number of returns that landed outside of the map."""
     shown = torch.tensor([float(outcome) for outcome in LANDING_COLOURS])
     x, y = column(records, "landing_x"), column(records, "landing_y")
     outside = (x < LANDING_X[0]) | (x > LANDING_X[1]) | (y < LANDING_Y[0]) | (y > LANDING_Y[1])
@@ -131,7 +131,7 @@ def _beyond(records: Tensor) -> int:
 
 
 def footwork(rows: Sequence[Row], table: TableConfig) -> Figure:
-    """Paths of the base on the floor, some worlds of each row; colour runs with the serves of a world."""
+    """Paths of the base on the floor, some worlds of each row; the colour is the number of the serve in its world."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.ticker import MaxNLocator
 
@@ -199,7 +199,7 @@ def _draw_table(axes: Axes, table: TableConfig) -> None:
 
 
 def _legend_dots(legend: Legend) -> None:
-    """Dots of a legend large and opaque, whatever they are in the panel."""
+    """Make the dots of a legend large and opaque."""
     from matplotlib.collections import PathCollection
 
     for handle in legend.legend_handles:

@@ -1,4 +1,4 @@
-"""Publishing a policy: a folder small enough for a repository, with the policy, how it was trained and how it plays.
+"""Publishing a policy: a folder small enough for a repository, with the policy, its training and its evaluation.
 
 It holds the weights (float32) and the configuration of a run's newest checkpoint, or of a checkpoint, without the
 training state; beside them the main columns of the run's metrics, its learning curve, the tables and figures of an
@@ -25,7 +25,7 @@ from pace.runs.run_folder import METRICS
 RUN_FILES = ("learning_curve.png", "versions.json")
 EVALUATION_FILES = ("evaluation.json", "evaluation.md", "evaluation.csv", "strike_map.png", "landing_map.png")
 SWEEP_FILES = ("sweep.json", "sweep.png")
-#: All that this module writes into a folder; other files there are not its own.
+#: All files that this module writes into a folder; it leaves other files alone.
 FILES = (META, WEIGHTS, METRICS, CARD, *RUN_FILES, *EVALUATION_FILES, *SWEEP_FILES)
 
 
@@ -34,7 +34,7 @@ class KeepError(RuntimeError):
 
 
 def keep_from_config(composed: DictConfig) -> None:
-    """Publish as the composed configuration says, and print what was written."""
+    """Publish as configured, and print the files."""
     config = parse(composed, KeepConfig)
     assert config.run is not None  # guaranteed by KeepConfig
     assert config.out is not None
@@ -51,11 +51,11 @@ def keep_from_config(composed: DictConfig) -> None:
 def keep(run: Path, folder: Path, evaluation: Path | None = None, notes: str = "") -> list[Path]:
     """Publish ``run`` and its ``evaluation`` as ``folder``, with ``notes`` in the card; returns the files written.
 
-    The folder appears when it is whole. A published policy that is there is replaced; files in it that this function
+    The folder appears when it is complete. An existing published policy is replaced; files in it that this function
     did not write stay.
 
-    Errors: :class:`CheckpointError` for a run that is none, or an evaluation folder without one; :class:`KeepError`
-    for a folder that holds anything else, or the run.
+    Errors: :class:`CheckpointError` for a ``run`` without a checkpoint, or an ``evaluation`` folder without results;
+    :class:`KeepError` for a folder that holds anything else, or the run.
     """
     checkpoint = find_checkpoint(run)
     if evaluation is not None and not (evaluation / "evaluation.json").is_file():
@@ -95,9 +95,9 @@ def is_published(folder: Path) -> bool:
 
 
 def write_policy(folder: Path, checkpoint: Path, evaluation: Path | None, notes: str) -> list[str]:
-    """Write all of a published policy into the new ``folder``; returns the names of the files."""
+    """Write all files of a published policy into the new ``folder``; returns their names."""
     export_weights(checkpoint, folder)
-    of_a_run = checkpoint.parent.name == FOLDER  # or else of a published policy, whose metrics are short already
+    of_a_run = checkpoint.parent.name == FOLDER  # else of a published policy, whose metrics are short already
     run = checkpoint.parent.parent if of_a_run else checkpoint
     sources = [run / name for name in RUN_FILES]
     sources += [evaluation / name for name in EVALUATION_FILES + SWEEP_FILES] if evaluation is not None else []
@@ -111,7 +111,7 @@ def write_policy(folder: Path, checkpoint: Path, evaluation: Path | None, notes:
 
 
 def copy_others(old: Path, fresh: Path) -> None:
-    """Copy what lies in ``old``, and is not of this module, into ``fresh``."""
+    """Copy the files of ``old`` that are not of this module into ``fresh``."""
     for entry in old.iterdir():
         if entry.name in FILES:
             continue

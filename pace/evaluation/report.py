@@ -59,7 +59,7 @@ def cells(row: Mapping[str, Any], paper: Mapping[str, PaperRow]) -> list[str]:
 
 
 def failure_cells(row: Mapping[str, Any]) -> list[str]:
-    """What became of the other serves, in per cent of all."""
+    """Outcomes of the serves without success, in per cent of all."""
     return [row["serve"], *(number(row["failures"][name] / max(row["serves"], 1), 100, 2) for name in FAILURES)]
 
 
@@ -97,7 +97,7 @@ def tables(rows: Sequence[Row], paper: Mapping[str, PaperRow], markdown: bool = 
     bins = [bin_label(name) for name in summaries[0]["predictor_rmse_cm_by_time"]]
     parts = [
         table(HEADER, [cells(row, paper) for row in summaries]),
-        "What became of the other serves, % of all:",
+        "Serves without success by outcome, % of all:",
         table(("serve", *(name.replace("_", " ") for name in FAILURES)), [failure_cells(row) for row in summaries]),
         "Error of the predicted apex, cm, by time before it:",
         table(("serve", *bins), [error_cells(row) for row in summaries]),
@@ -132,7 +132,7 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """One line a row, NaN as an empty cell."""
+    """One line per row, NaN as an empty cell."""
     flattened = [clean(flat(row)) for row in rows]
     text = io.StringIO()
     writer = csv.DictWriter(text, list(flattened[0]))
@@ -142,7 +142,7 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def write_serves(path: Path, rows: Sequence[Row]) -> None:
-    """Every counted serve, one a line: its range, then ``COLUMNS``."""
+    """Every counted serve, one per line: its range, then ``COLUMNS``."""
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(("serve", *COLUMNS))
@@ -172,5 +172,6 @@ def describe(context: Mapping[str, Any]) -> str:
     return (
         f"Ball {context['ball']}, engine {context['engine']} at {1000 * context['physics_dt']:g} ms, randomization "
         f"{context['randomization']}, sensing {context['sensing']}, seed {context['seed']}, "
-        f"{context['num_worlds']} worlds that play on; the first {context['warmup_serves']} serves of each not counted."
+        f"{context['num_worlds']} worlds without episode ends; the first {context['warmup_serves']} serves of each not "
+        "counted."
     )

@@ -1,8 +1,8 @@
-"""Counting what a policy does with many serves: the rows of the paper's table II.
+"""Hits and returns of a policy over many serves: the rows of the paper's table II.
 
-Each of N worlds plays on without end and contributes the same number of serves, whatever becomes of them: a stop at a
-total would favour serves that end early, which are the lost ones. The first two serves of a world are not counted (the
-paper's rule); those after a fall are, for the fall is the policy's own doing.
+Each of N worlds plays without episode ends and contributes the same number of serves, whatever their outcome: a stop at
+a total would favour serves that end early, which are the lost ones. The first two serves of a world are not counted
+(the paper's rule). Serves after a fall are counted, because the policy caused the fall.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ COLUMNS = (
     "serve_vx", "serve_vy", "serve_vz",  # at launch
     "outcome",  # pace.task.game.Outcome
     "hit", "rim", "fall",  # 0 or 1; fall: the robot fell, or left its area, before the serve was over
-    "strike_x", "strike_y", "strike_z",  # where the paddle met the ball
+    "strike_x", "strike_y", "strike_z",  # of the paddle's contact with the ball
     "speed_out",  # of the ball after the hit
     "landing_x", "landing_y", "net_height",  # of the flight after the hit (its forecast, which is the simulation)
 )  # fmt: skip
 C = {name: index for index, name in enumerate(COLUMNS)}
-#: What can become of a serve without success; ``rim`` goes before where the ball went from there.
+#: Failures of a serve; ``rim`` takes precedence over the outcome after it.
 FAILURES = ("miss", "net", "out", "own_side", "rim", "double_hit", "volley", "fall")
-#: Outcomes that a hit by the rim accounts for.
+#: Outcomes that count as ``rim`` after a hit with the rim.
 RIM_FAULTS = (Outcome.NET, Outcome.OUT, Outcome.OWN_SIDE)
 Z95 = 1.959963984540054  # 97.5 % quantile of the normal distribution
-PATH_WORLDS = 6  # worlds whose footwork is kept
+PATH_WORLDS = 6  # worlds whose base path is kept
 PATH_STEPS = 400  # control steps of it, 8 s
-PATIENCE = 4  # times the longest that the serves can take: then serves keep missing the table
-STEPS_PER_LOOK = 10  # control steps between two looks at the counts: each look waits for the device
+PATIENCE = 4  # times the longest duration of the serves; beyond it serves keep missing the table
+STEPS_PER_LOOK = 10  # control steps between two reads of the counts: each read waits for the device
 
 OnCount = Callable[[int], None]
 
@@ -60,12 +60,12 @@ def wilson(count: int, total: int) -> tuple[float, float]:
 
 
 class ServeRecorder:
-    """Writes down, on the device, what becomes of each serve of an environment's worlds.
+    """Records, on the device, the outcome of each serve of an environment's worlds.
 
     Call :meth:`begin` after the worlds' reset, :meth:`observe` after each ``advance`` and before the reset of fallen
     worlds, :meth:`begin` again after that.
 
-    Attributes: ``records`` (N * quota + 1, columns), world by world, the last row of no meaning; ``counted``,
+    Attributes: ``records`` (N * quota + 1, columns), world by world, the last row unused; ``counted``,
     ``played``, ``bad`` (N,); ``path`` (T, W, 3) base x, y (m) and number of the serve, NaN where not filled.
     """
 
@@ -90,11 +90,11 @@ class ServeRecorder:
 
     @property
     def counting(self) -> Tensor:
-        """Worlds (N,) bool whose present serve will be counted."""
+        """Worlds (N,) bool whose current serve will be counted."""
         return (self.played >= self._warmup) & (self.counted < self.quota)
 
     def begin(self) -> None:
-        """Note the launch of the serves that begin now, and the prediction that the policy is about to act on."""
+        """Record the launch of the serves that begin now, and the prediction before the policy's next action."""
         fresh = torch.full_like(self._current, torch.nan)
         fresh[:, :3] = self.env.worlds.ball.velocity
         fresh[:, C["hit"] : C["fall"] + 1] = 0.0
@@ -102,7 +102,7 @@ class ServeRecorder:
         self._note_prediction()
 
     def observe(self) -> None:
-        """Take in the control step that was just made."""
+        """Record the last control step."""
         self._note_hits()
         self._note_path()
         self._close(self.env.serve_over)
@@ -158,7 +158,7 @@ class ServeRecorder:
 
 @dataclass(frozen=True)
 class Row:
-    """One serve range: the summary that files hold; every counted serve (M, columns of ``COLUMNS``) and the footwork of
+    """One serve range: the summary for the files; every counted serve (M, columns of ``COLUMNS``) and the base paths of
     some worlds (T, W, 3) as in :class:`ServeRecorder`, on the CPU."""
 
     summary: dict[str, Any]
@@ -173,10 +173,10 @@ class Row:
 
 
 def play(env: TableTennisEnv, policy: TaskPolicy, recorder: ServeRecorder, on_count: OnCount | None = None) -> None:
-    """Play until every world has its serves. ``on_count`` hears how many have been counted in all.
+    """Play until every world has its serves. ``on_count`` is called with the number of all counted serves.
 
-    Errors: :class:`EvaluationError` when serves keep missing the robot's half, or a value is not finite. A
-    ``RuntimeWarning`` when the engine had no room for all contacts.
+    Errors: :class:`EvaluationError` if serves keep missing the robot's half, or a value is not finite. A
+    ``RuntimeWarning`` if the contacts exceeded the engine's memory.
     """
     total = env.num_worlds * recorder.quota
     longest = math.ceil(env.config.serve.max_duration / env.worlds.control_dt) + 1
@@ -211,7 +211,7 @@ def evaluate_row(
     warmup_serves: int = 2,
     on_count: OnCount | None = None,
 ) -> Row:
-    """Play at least ``serves`` serves of the range ``serve`` (a name of configs/serve/), without end.
+    """Play at least ``serves`` serves of the range ``serve`` (a name of configs/serve/), without episode ends.
 
     ``overrides`` as for :func:`~pace.config.overrides.override_task`. The same arguments, on the same
     device, give the same row.
@@ -240,7 +240,7 @@ def summarise(serve: str, records: Tensor, target: tuple[float, float], clear_he
     """Rates and means of a row from its records (M, columns).
 
     Shares are of the serves; ``outbound_speed`` (m/s) is a mean over hits, ``landing_error`` (m, to ``target``) and
-    ``net_clearance`` (m, under the ball; ``clear_height`` m is the lowest that passes) over successes.
+    ``net_clearance`` (m, under the ball; ``clear_height`` m is the lowest height that passes) over successes.
     """
     total = records.shape[0]
     hit = records[:, C["hit"]] > 0
@@ -269,12 +269,12 @@ def summarise(serve: str, records: Tensor, target: tuple[float, float], clear_he
 
 
 def _mean(values: Tensor) -> float:
-    """Mean of the values that are there."""
+    """Mean without NaN."""
     return float(values[~values.isnan()].double().mean())
 
 
 def count_failures(records: Tensor) -> dict[str, int]:
-    """What became of the serves without success, by the names of :data:`FAILURES`; the counts add up to them."""
+    """Counts of the serves without success, by the names of :data:`FAILURES`; the counts add up to them."""
     outcome, rim = records[:, C["outcome"]], records[:, C["rim"]] > 0
     by_rim = rim & sum((outcome == code for code in RIM_FAULTS), torch.zeros_like(rim))
     counts = {name: int(((outcome == Outcome[name.upper()]) & ~by_rim).sum()) for name in FAILURES if name != "rim"}

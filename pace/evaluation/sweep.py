@@ -1,4 +1,4 @@
-"""What a policy survives: the table again under other balls, engines, sensors and bodies, one change at a time."""
+"""Robustness sweep: the table under other balls, engines, sensors and bodies, one change at a time."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from pace.evaluation.serves import EvaluationError
 from pace.rl.policies import TaskPolicy
 
 JSON, MAP = "sweep.json", "sweep.png"
-SERVES_PER_WORLD = 4  # counted, in a cell: more waste less on those that are not, and fill the cores less
+SERVES_PER_WORLD = 4  # counted, in a cell: more waste a smaller share on uncounted serves, but fill fewer cores
 SLOWNESS = 10.0  # times that mjwarp takes on a CPU (docs/results/speed.md), for the time that is left
 Tables = dict[str, list[dict[str, Any]]]  # summaries of a cell's rows, by its key
 LABELS = {"noise": "sensing noise", "trunk_mass": "trunk mass", "gain": "joint gains"}
@@ -32,7 +32,7 @@ LABELS = {"noise": "sensing noise", "trunk_mass": "trunk mass", "gain": "joint g
 
 @dataclass(frozen=True)
 class Variation:
-    """One change of the task: which, its value, and the overrides that make it."""
+    """One change of the task: its kind, its value, and its overrides."""
 
     kind: str
     value: str
@@ -40,7 +40,7 @@ class Variation:
 
     @property
     def label(self) -> str:
-        """As it stands in the heat map."""
+        """Its label in the heat map."""
         return f"{LABELS.get(self.kind, self.kind)} {self.value}".strip()
 
 
@@ -50,7 +50,7 @@ def ball_presets() -> list[str]:
 
 
 def variations(task: TrainConfig, chosen: VariationConfig) -> list[Variation]:
-    """The task as it is, then each change of ``chosen``; changes start from the values of ``task``."""
+    """The unchanged task, then each change of ``chosen``; changes start from the values of ``task``."""
     sensing, bodies = task.sensing, task.randomization
     cells = [Variation("as given", "", ())]
     cells += [Variation("ball", name, (f"ball={name}",)) for name in chosen.ball or ball_presets()]
@@ -87,7 +87,8 @@ class Cell:
     """A variation as it is played: the overrides of the saved task, the device (the CPU for engine=native), serves a
     row and worlds, and the time that it takes in serves of the fast engine.
 
-    ``key`` tells what its figures depend on: cells of one key are played once, and found again in a sweep's file.
+    ``key`` identifies all settings that its numbers depend on: cells with the same key are played once, and found again
+    in a sweep's file.
     """
 
     variation: Variation
@@ -118,7 +119,7 @@ def plan_cell(
     task = override_task(policy.config, changed)
     task.engine.name = engine_name(task, device.type)
     if task.engine.name == "native" and device.type == "cuda":
-        device, task.engine.graph = torch.device("cpu"), "auto"  # a GPU's graphs do not go with it
+        device, task.engine.graph = torch.device("cpu"), "auto"  # no CUDA graphs on a CPU
         changed = (*changed, "engine.graph=auto")
     slow = task.engine.name == "mjwarp" and device.type == "cpu"
     serves = config.sweep_serves_slow if slow else config.sweep_serves
@@ -131,9 +132,9 @@ def plan_cell(
 
 
 def finished_cells(folder: Path, cells: Sequence[Cell]) -> Tables:
-    """Rows of those ``cells`` that a sweep in ``folder`` has finished, by key; empty where there was none.
+    """Rows of those ``cells`` that a sweep in ``folder`` has finished, by key; empty without a sweep.
 
-    Errors: :class:`EvaluationError` for a ``sweep.json`` that is not one, or has cells of another sweep to lose.
+    Errors: :class:`EvaluationError` for an unreadable ``sweep.json``, or one that holds cells of another sweep.
     """
     file = folder / JSON
     if not file.exists():
@@ -161,7 +162,7 @@ def cells_to_play(cells: Sequence[Cell], finished: Tables) -> list[Cell]:
 def write_sweep(folder: Path, cells: Sequence[Cell], tables: Tables, context: Mapping[str, Any]) -> list[Path]:
     """``sweep.json`` and the heat map in ``folder``, of those ``cells`` that ``tables`` has the rows of.
 
-    Each file is written under another name first, so that an interruption leaves the last one whole.
+    Each file is written under another name first, so that an interruption leaves the previous one intact.
     """
     done = [cell for cell in cells if cell.key in tables]
     entries = [_entry(cell, tables[cell.key]) for cell in done]

@@ -1,5 +1,5 @@
-"""What the robot computes from its sensors, one torch module each: run by the environment and by the exported file.
+"""On-board estimators of the robot, one torch module each: run by the environment and by the exported file.
 
-Here belongs all that runs on the robot between its readings and its actor; nothing that knows the simulation's truth.
+All code that runs on the robot between its readings and its actor belongs here; the simulation's truth does not.
 Every module is a pure function of one control step: state and readings -> new state. :mod:`pace.onboard.actor` is one
 step of all, :mod:`pace.onboard.estimates` the table of the estimates. Imports ``config``, ``sim`` and ``predictor``."""

@@ -1,4 +1,4 @@
-"""One control step of all that a robot computes between its readings and the network of its policy."""
+"""One control step of all on-board estimators between a robot's readings and its policy network."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ class Readings(NamedTuple):
 
 @dataclass
 class Signals:
-    """All that the actor may see.
+    """All inputs of the actor.
 
     Attributes: ``sensing``, the readings; ``action`` (N, J) the previous action; ``track`` of the ball; ``prediction``
     (N, P) raw output; ``apex``, ``target`` (N, 3) m predicted, ``time`` (N,) s until the ball is at the target,
-    ``shift`` (N, 2) m from the sensed base to where it should stand; ``paddle_position`` (N, 3) m, ``paddle_normal``
+    ``shift`` (N, 2) m from the sensed base to its target; ``paddle_position`` (N, 3) m, ``paddle_normal``
     (N, 3); ``estimates``, the state (N, S) of each estimate by name.
     """
 
@@ -60,7 +60,7 @@ class Signals:
     estimates: dict[str, Tensor]
 
     def computed(self) -> dict[str, Tensor]:
-        """All but readings and action, by the names under which checkpoints have them."""
+        """All but readings and action, by their names in checkpoints."""
         names = ("prediction", "apex", "target", "time", "shift", "paddle_position", "paddle_normal")
         track = {f"track.{name}": value for name, value in self.track._asdict().items()}
         own = {f"actor.{name}": getattr(self, name) for name in names}
@@ -71,7 +71,7 @@ class Onboard(nn.Module):
     """The steps in their order: the ball's track; the estimates that the paddle's pose is computed from; that pose; the
     prediction; the other estimates.
 
-    While there is nothing to hit the prediction is replaced by the point to stand by. Without a predictor (ablation)
+    While there is nothing to hit, the idle point replaces the prediction. Without a predictor (ablation)
     the predicted quantities are zero.
 
     Args:
@@ -95,7 +95,7 @@ class Onboard(nn.Module):
         self.predictor = predictor if config.predictor.enabled else None
 
     def estimate(self, name: str) -> Estimate:
-        """An estimate of the policy's."""
+        """One of the policy's estimates."""
         found = self.estimates[name]
         assert isinstance(found, Estimate)
         return found
@@ -114,11 +114,11 @@ class Onboard(nn.Module):
         new_ball: Tensor,
         started: Tensor | None = None,
     ) -> Signals:
-        """One control step later.
+        """The signals after one more control step.
 
-        Args: sensing: the readings; action (N, J) that was done; track, estimates: those of :class:`Signals` of the
-        step before; new_ball (N,) bool: balls just launched; started (N,) bool: the others begin as in :meth:`begin`,
-        whatever the step before says of them; ``None``: all have.
+        Args: sensing: the readings; action (N, J) of the step; track, estimates: those of :class:`Signals` of the
+        previous step; new_ball (N,) bool: balls just launched; started (N,) bool: the other worlds begin as in
+        :meth:`begin`, and their previous step is ignored; ``None``: all have started.
         """
         new_ball = new_ball if started is None else new_ball | ~started
         track = self.track(track.positions, track.turned, sensing.ball_position, new_ball)
@@ -132,7 +132,7 @@ class Onboard(nn.Module):
         return self._complete(sensing, action, track, advance)
 
     def _complete(self, sensing: Readings, action: Tensor, track: Track, advance: Advance) -> Signals:
-        """Everything that follows from readings, ball's track and the estimates' states before."""
+        """All signals from readings, ball track and the estimates' previous states."""
         known = {**sensing._asdict(), "action": action, "track": track.positions}
         known |= {"turned": track.turned, "something_to_hit": track.something_to_hit}
         states = self._advance(known, advance, for_the_pose=True)
@@ -148,7 +148,7 @@ class Onboard(nn.Module):
         return {name: advance(name, {read: known[read] for read in entry.reads}) for name, entry in chosen.items()}
 
     def _paddle_pose(self, sensing: Readings, states: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """From the estimates' states, and from what is sensed if they have no say."""
+        """The paddle's pose from the estimates' states, or from the readings that no estimate replaces."""
         seen = sensing._asdict()
         for name, state in states.items():
             columns = self.estimate(name).columns

@@ -1,4 +1,4 @@
-"""The robot's orientation: gyroscope over short times, sensed gravity and heading over long ones."""
+"""The robot's orientation: gyroscope at high frequencies, sensed gravity and heading at low ones."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ SMALLEST_TILT = 1.0e-3
 
 
 class AttitudeEstimate(Estimate):
-    """A complementary filter of each robot's orientation, as the inertial unit of a robot has it.
+    """A complementary filter of each robot's orientation, as in a robot's inertial unit.
 
-    Each control step the last estimate is turned by the gyroscope, and ``gain`` of it is replaced by what is sensed.
-    With the paper's noise (gravity and heading +-0.05 a step, 0.03 in root mean square) and a gain of 0.1 gravity is
-    known to 0.007, heading to 0.009: 0.8 m away, at the paddle, 7 mm instead of 24. A turn is known at once, however
-    late motion capture is. An episode begins with what is sensed.
+    Each control step the last estimate is rotated by the gyroscope, and a share ``gain`` of it is replaced by the
+    sensed value. With the paper's noise (gravity and heading +-0.05 a step, root mean square 0.03) and a gain of 0.1
+    the error is 0.007 for gravity and 0.009 for heading: at the paddle, 0.8 m away, 7 mm instead of 24. A turn shows
+    without the delay of motion capture. An episode begins with the sensed values.
 
     Args: config: numbers of the filter; control_dt: s; joints: J.
     """
@@ -62,9 +62,9 @@ def _state(gravity: Tensor, heading: Tensor, angular_velocity: Tensor) -> Tensor
 
 
 def yaw_rate(gravity: Tensor, angular_velocity: Tensor) -> Tensor:
-    """How fast the trunk's x axis turns on the ground, (N, 1) rad/s, from (N, 3) each, body frame.
+    """Yaw rate of the trunk's x axis on the ground, (N, 1) rad/s, from (N, 3) each, body frame.
 
-    Rotation about that axis itself does not turn it.
+    Rotation about that axis does not contribute.
     """
     tilt = gravity[:, 1:].square().sum(1, keepdim=True).clamp(min=SMALLEST_TILT)
     return -(gravity[:, 1:] * angular_velocity[:, 1:]).sum(1, keepdim=True) / tilt

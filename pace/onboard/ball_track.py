@@ -1,4 +1,4 @@
-"""The last sensed positions of the current ball, and what they say about it."""
+"""The last sensed positions of the current ball, and two flags derived from them."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from pace.config.task import TaskConfig
 
 
 class Track(NamedTuple):
-    """A ball as its robot has followed it.
+    """The track of a robot's ball.
 
-    ``positions`` (N, 3 * frames) m, oldest first, the predictor's input (before a ball has been seen that often, its
-    first position is repeated); ``turned`` (N,) bool, the ball has been seen moving away since it was launched;
-    ``something_to_hit`` (N,) bool, as far as the robot can know.
+    ``positions`` (N, 3 * frames) m, oldest first, the predictor's input (until a ball has been sensed that often, its
+    first position is repeated); ``turned`` (N,) bool, the ball was sensed moving away since its launch;
+    ``something_to_hit`` (N,) bool, estimated from the sensed positions.
     """
 
     positions: Tensor
@@ -25,7 +25,7 @@ class Track(NamedTuple):
 
 
 class BallTrack(nn.Module):
-    """Follows each robot's ball.
+    """Tracks each robot's ball.
 
     Args: config: ``predictor.frames``, ``sensing.moved`` and ``reward.nothing_to_hit``.
     Errors: :class:`ConfigError` for fewer than three frames.
@@ -47,7 +47,7 @@ class BallTrack(nn.Module):
         return self._judge(positions, torch.zeros_like(sensed[:, 0], dtype=torch.bool))
 
     def forward(self, positions: Tensor, turned: Tensor, sensed: Tensor, new_ball: Tensor) -> Track:
-        """One control step later.
+        """The track after one more control step.
 
         Args: positions (N, 3 * frames) m and turned (N,) bool of the step before; sensed (N, 3) m; new_ball (N,) bool
         marks balls that were just launched.
@@ -55,17 +55,17 @@ class BallTrack(nn.Module):
         return self._judge(self.append(positions, sensed, new_ball), turned & ~new_ball)
 
     def append(self, positions: Tensor, sensed: Tensor, new_ball: Tensor) -> Tensor:
-        """The positions (N, 3 * frames) m alone, one control step later."""
+        """The positions (N, 3 * frames) m alone, after one more control step."""
         longer = torch.cat((positions[:, 3:], sensed), dim=1)
         return torch.where(new_ball.unsqueeze(1), sensed.repeat(1, self.frames), longer)
 
     def _judge(self, positions: Tensor, turned: Tensor) -> Track:
-        # over two steps: noise matters less. A ball that is seen late stands still at first, but for the noise
+        # over two steps, to reduce the effect of noise. A ball sensed with delay stands still at first, up to noise
         change = positions[:, -3:] - positions[:, -9:-6]
         gone = (change[:, 0] > self.moved) | turned
         return Track(positions, gone, ~(gone | self._nothing_to_hit(positions[:, -3:], change)))
 
     def _nothing_to_hit(self, position: Tensor, change: Tensor) -> Tensor:
-        """As for the referee (:func:`pace.task.rules.nothing_to_hit`): past the robot, too low, falling."""
+        """As in the referee (:func:`pace.task.rules.nothing_to_hit`): past the robot, too low, falling."""
         x, z = position[:, 0], position[:, 2]
         return (x < self.past_x) | (z < self.low_z) | ((x < self.falling_x) & (change[:, 2] < 0.0))

@@ -1,4 +1,4 @@
-"""How late motion capture is: its yaw against the gyroscope's, as cameras and inertial units are calibrated in time."""
+"""Delay of motion capture: its yaw against the gyroscope's, as in the temporal calibration of cameras and IMUs."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ class DelayEstimate(Estimate):
 
     The gyroscope reports a turn at once, motion capture ``delay`` seconds later: yaw(t) = psi(t) - delay * rate(t), as
     long as the rate changes little within the delay. Differences from step to step, smoothed by the same filter on both
-    sides, leave out where the yaw began:
+    sides, do not depend on the initial yaw:
 
         behind = F[rate dt - yaw step] = delay * F[rate step] = delay * change
 
     and least squares over all steps, with a prior, is the estimate: (sum change * behind + prior * worth) /
-    (sum change^2 + worth). One swing at 4 rad/s is worth as much as the prior and more.
+    (sum change^2 + worth). One swing at 4 rad/s outweighs the prior.
 
     Args: config: numbers of the estimate; control_dt: s; joints: J.
     """
@@ -38,7 +38,7 @@ class DelayEstimate(Estimate):
             "known": Part(1, "1", "1"),
             "yaw": Part(1, "rad", "sensed one step ago"),
             "rate": Part(1, "rad/s", "of the yaw, one step ago"),
-            "behind": Part(1, "rad", "filtered: how far the yaw is behind what the rate says"),
+            "behind": Part(1, "rad", "filtered: lag of the sensed yaw behind the integrated rate"),
             "change": Part(1, "rad/s", "filtered: change of the rate"),
             "products": Part(1, "rad^2/s", "sum of change times behind"),
             "squares": Part(1, "rad^2/s^2", "sum of the squares of change"),
@@ -46,7 +46,7 @@ class DelayEstimate(Estimate):
         }
 
     def begin(self, base_angular_velocity: Tensor, projected_gravity: Tensor, heading: Tensor) -> Tensor:
-        """The state (N, 8) from (N, 3) rad/s and (N, 3), body frame, and (N, 2), world frame; nothing is learned."""
+        """The state (N, 8) from (N, 3) rad/s and (N, 3), body frame, and (N, 2), world frame; delay: the prior."""
         yaw, rate = _yaw(heading), yaw_rate(projected_gravity, base_angular_velocity)
         return torch.cat((torch.ones_like(yaw), yaw, rate, torch.zeros_like(yaw).expand(-1, 5)), dim=1)
 

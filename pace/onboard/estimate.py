@@ -1,4 +1,4 @@
-"""An estimate: what the robot works out over an episode, one control step at a time."""
+"""An estimate: a quantity that the robot computes over an episode, one control step at a time."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Estimate(nn.Module):
     - ``forward(state, **signals)``: the state after one more control step.
 
     The signals are those that its entry in :data:`pace.onboard.estimates.ESTIMATES` names, as keyword arguments. Both
-    are pure: they write into no argument, read no value on the host and use operators that ONNX knows.
+    are pure: they write into no argument, read no value on the host and use operators that ONNX has.
 
     Attributes: ``columns`` part -> columns of the state; ``size``.
     """
@@ -48,6 +48,6 @@ class Estimate(nn.Module):
 
 
 def columns(parts: Mapping[str, Part]) -> dict[str, slice]:
-    """Columns of each part, one beside the other."""
+    """Columns of each part, concatenated."""
     ends = accumulate(part.size for part in parts.values())
     return {name: slice(end - part.size, end) for (name, part), end in zip(parts.items(), ends, strict=True)}

@@ -1,11 +1,11 @@
-"""The table of estimates: environment, exported file and checkpoint iterate it, and each picks up what stands in it.
+"""The table of estimates, which environment, exported file and checkpoint iterate.
 
 To add an estimate, write a subclass of :class:`pace.onboard.estimate.Estimate` and a dataclass of its numbers, and
-enter both, from your own package or here::
+register both, from your package or here::
 
     ESTIMATES["tilt"] = Entry("tilt", TiltConfig, TiltEstimate, ("projected_gravity",), {"estimated_tilt": "tilt"})
 
-``estimated_tilt`` is then an observation of the actor like any other. Its numbers stand in YAML under
+``estimated_tilt`` is then an observation of the actor like any other. Its numbers are in YAML under
 ``observation.estimates.tilt`` and are checked against the dataclass.
 """
 
@@ -36,14 +36,14 @@ from pace.onboard.returns import ReturnMemory
 class Entry:
     """One estimate.
 
-    Attributes: ``numbers``, key of the observation's configuration under which its numbers stand
+    Attributes: ``numbers``, key of its numbers in the observation's configuration
     (:meth:`pace.config.task.ObservationConfig.numbers`); ``config``, their dataclass; ``make``, the module's class;
-    ``reads``, the signals that it is given: readings by their names (:class:`pace.onboard.actor.Readings`), ``action``,
+    ``reads``, its input signals: readings by their names (:class:`pace.onboard.actor.Readings`), ``action``,
     ``track`` (N, 3 * frames), ``turned`` (N,), ``something_to_hit`` (N,), ``paddle_position``, ``paddle_normal``,
     ``apex``, ``target``, ``time``; ``observations``, name of an observation of the actor -> part of the state;
-    ``replaces``, reading -> part that the paddle's pose is computed from in its place. Such an estimate comes before
-    the paddle's pose and the prediction, and may read readings and ``action`` alone. ``frames``: how many of
-    the ball's positions it needs.
+    ``replaces``, reading -> part that replaces it in computing the paddle's pose. Such an estimate runs before
+    the paddle's pose and the prediction, and may read readings and ``action`` alone. ``frames``: number of
+    the ball's positions that it needs.
     """
 
     numbers: str
@@ -57,7 +57,7 @@ class Entry:
 
 _TURNS = ("base_angular_velocity", "projected_gravity", "heading")
 
-#: Name of each estimate, as in checkpoints and in the exported file's state -> what it is.
+#: Name of each estimate, as in checkpoints and in the exported file's state -> its entry.
 ESTIMATES: dict[str, Entry] = {
     "memory": Entry(
         "return_memory",
@@ -88,7 +88,7 @@ ESTIMATES: dict[str, Entry] = {
 
 
 def observed(observation: ObservationConfig) -> dict[str, Entry]:
-    """The estimates that the policy observes, by name: these are computed, and no others."""
+    """The estimates that the policy observes, by name; only these are computed."""
     seen = set(observation.policy)
     return {name: entry for name, entry in ESTIMATES.items() if seen.intersection(entry.observations)}
 
@@ -104,7 +104,7 @@ def make_estimates(config: TaskConfig, joints: int) -> dict[str, Estimate]:
 
 
 def numbers(observation: ObservationConfig, name: str) -> Any:
-    """The numbers of an estimate, an instance of its dataclass; ``None``: there are none.
+    """The numbers of an estimate, an instance of its dataclass; ``None`` if none are given.
 
     Errors: :class:`ConfigError` for numbers that do not fit the dataclass.
     """

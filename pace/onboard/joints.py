@@ -1,4 +1,4 @@
-"""The robot's joints: positions and velocities that are better known over several control steps than from one."""
+"""Joint positions and velocities, filtered over several control steps."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from torch import Tensor
 from pace.config.task import JointEstimateConfig
 from pace.onboard.estimate import Estimate, Part
 
-SETTLED = 1e-12  # relative change of the filter's covariance at which its gain is taken
-LONGEST = 100_000  # control steps that it may take to settle
+SETTLED = 1e-12  # relative change of the filter's covariance at convergence
+LONGEST = 100_000  # control steps allowed until convergence
 
 
 class JointEstimate(Estimate):
-    """A Kalman filter of each joint, which moves on at the velocity it has: steady gains, no model of the robot.
+    """A Kalman filter of each joint with a constant-velocity model: steady gains, no model of the robot.
 
-    With the paper's noise (+-0.01 rad and +-1.5 rad/s, 0.0058 and 0.87 in root mean square) joints of a robot that
-    plays are known to 0.0053 rad and 0.47 rad/s, with twice the noise to 0.010 and 0.77 (of 0.012 and 1.7). An episode
-    begins with what is sensed.
+    With the paper's noise (+-0.01 rad and +-1.5 rad/s, root mean square 0.0058 and 0.87) the error for a playing robot
+    is 0.0053 rad and 0.47 rad/s; with twice the noise (0.012 and 1.7) it is 0.010 and 0.77. An episode begins with the
+    sensed values.
 
     Args: config: numbers of the filter; control_dt: s; joints: J.
     """
@@ -53,9 +53,9 @@ class JointEstimate(Estimate):
 
 
 def steady_gain(config: JointEstimateConfig, control_dt: float) -> NDArray[np.float64]:
-    """Kalman gain (2, 2) after many control steps: what position and velocity gain from either's innovation.
+    """Kalman gain (2, 2) after many control steps: rows position and velocity, columns their innovations.
 
-    Between two of them a joint is accelerated by a constant, sampled independently each time with root mean square
+    Within a control step a joint has a constant acceleration, sampled independently for each step with root mean square
     ``config.acceleration``. Source: Bar-Shalom, Li and Kirubarajan 2001, section 6.3.2.
     """
     step = np.array([[1.0, control_dt], [0.0, 1.0]])

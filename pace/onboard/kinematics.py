@@ -13,12 +13,12 @@ SMALLEST_LENGTH = 1e-9  # a direction shorter than this has none
 class PaddleChain(nn.Module):
     """Pose of the paddle from that of the trunk and the joints between them.
 
-    The robots are the last dimension inside: a sum over N robots then runs along memory, four times as fast as N small
-    matrix products.
+    The robots are the last dimension inside: operations over N robots are then contiguous in memory, four times as fast
+    as N small matrix products.
 
     Args: model of the robot; site at the centre of the blade (``RobotSpec.paddle``).
 
-    Errors: ``ValueError`` if a body between trunk and paddle has no joint of its own.
+    Errors: ``ValueError`` if a body between trunk and paddle does not have exactly one joint.
     """
 
     joints: Tensor
@@ -62,7 +62,7 @@ class PaddleChain(nn.Module):
 
 
 def _path(model: mujoco.MjModel, site: str) -> list[int]:
-    """Bodies from the trunk, which is left out, to the paddle's."""
+    """Bodies from the trunk (exclusive) to the paddle's."""
     body = int(model.site(site).bodyid[0])
     path: list[int] = []
     while body != int(model.jnt_bodyid[0]):
@@ -107,5 +107,5 @@ def to_world(vectors: Tensor, gravity: Tensor, heading: Tensor) -> Tensor:
 
 
 def _rotate(a: Tensor, b: Tensor, cos: Tensor, sin: Tensor) -> tuple[Tensor, Tensor]:
-    """Both coordinates after a turn from the first axis towards the second."""
+    """Both coordinates after a rotation from the first axis towards the second."""
     return cos * a - sin * b, sin * a + cos * b

@@ -1,4 +1,4 @@
-"""What the robot believes of the ball's future: the learned prediction, and where it has to stand for it."""
+"""The robot's prediction of the ball, and the base target that follows from it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from pace.config.task import RewardConfig, TaskConfig
 from pace.predictor.network import predictor_slices
 
-#: Times further ahead than this are as good as none, s.
+#: Longer predicted times are clamped to this, s.
 LONGEST_TIME = 2.0
 
 
@@ -22,7 +22,7 @@ def idle_point(config: RewardConfig) -> list[float]:
 
 class Prediction(NamedTuple):
     """``apex`` and paddle's ``target`` (N, 3) m, ``time`` (N,) s until the ball is at the target, ``shift`` (N, 2) m
-    from the sensed base to where it should stand."""
+    from the sensed base to its target."""
 
     apex: Tensor
     target: Tensor
@@ -31,7 +31,7 @@ class Prediction(NamedTuple):
 
 
 class PredictionReader(nn.Module):
-    """Reads the predictor's output. While there is nothing to hit, the point to stand by takes its place."""
+    """Reads the predictor's output. While there is nothing to hit, the idle point replaces it."""
 
     arm_offset: Tensor
     idle_base: Tensor

@@ -1,4 +1,4 @@
-"""What the robot remembers of its own returns: how they left the paddle, and what that says about its restitution."""
+"""Memory of the robot's returns: their velocity after the hit, and the restitution estimated from it."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ FRAMES = 5
 class ReturnMemory(Estimate):
     """The returns of each robot since its episode began, from sensed signals alone.
 
-    A ball that is first seen moving away near the paddle was hit about one control step before. Its sensed positions
-    give its velocity before (from four to two steps before it was seen to turn) and after (the two steps from then on),
-    forward kinematics gives velocity and normal of the paddle one step before. With them
+    If the ball is first sensed moving away near the paddle, it was hit about one control step earlier. The ball's
+    sensed positions give its velocity before the hit (from four to two steps before it was seen to turn) and after it
+    (over the next two steps). Forward kinematics gives velocity and normal of the paddle one step earlier. With them
 
         e = -(v_after - v_paddle) . n / (v_before - v_paddle) . n
 
-    is one estimate of the restitution; the mean of all, with the prior as so many hits more, is what the robot knows
-    of its paddle and ball. Single estimates are rough: noise of the ball's positions alone is worth 0.03, and the
-    paddle's velocity changes within the step in which the hit falls.
+    is one estimate of the restitution. The robot's estimate for its paddle and ball is the mean of all, in which the
+    prior counts as so many hits. Single estimates are rough: noise of the ball's positions alone adds an error of 0.03,
+    and the paddle's velocity changes within the step of the hit.
 
     Args: config: numbers of the estimate; control_dt: s; joints: J.
     """
@@ -34,7 +34,7 @@ class ReturnMemory(Estimate):
     def __init__(self, config: ReturnMemoryConfig, control_dt: float, joints: int) -> None:
         super().__init__(joints)
         self.config, self.span = config, 2.0 * control_dt
-        # in the two steps to the hit, and from it
+        # in the two steps before the hit, and after it
         self.register_buffer("fall", torch.tensor([0.0, 0.0, self.span * GRAVITY]), persistent=False)
 
     @staticmethod
@@ -64,7 +64,7 @@ class ReturnMemory(Estimate):
         """The state (N, 24) after this step.
 
         Args: state (N, 24) before it; track (N, 3 * frames) m, the ball's last positions, oldest first; turned (N,)
-        bool, the ball has been seen moving away; position (N, 3) m and normal (N, 3) of the paddle.
+        bool, the ball was sensed moving away; position (N, 3) m and normal (N, 3) of the paddle.
         """
         last_age, last, second_last, last_normal, last_hit, seen = state.split([1, 3, 3, 3, 9, 5], dim=1)
         ball = track.unflatten(1, (-1, 3))
@@ -75,7 +75,7 @@ class ReturnMemory(Estimate):
         swing = (paddle_position - second_last) / self.span
         hit = torch.where(turning, torch.cat((before, swing, last_normal), dim=1), last_hit)
         far = (newest - paddle_position).square().sum(1, keepdim=True).sqrt() > self.config.reach
-        age = torch.where(turning & far, 4.0, age)  # not the paddle turned it
+        age = torch.where(turning & far, 4.0, age)  # turned by something other than the paddle
         seen = torch.where(leaving, self._learn(hit, speed, seen), seen)
         return torch.cat((age, paddle_position, last, paddle_normal, hit, seen), dim=1)
 
@@ -92,7 +92,7 @@ class ReturnMemory(Estimate):
         parting = ((after + self.fall - paddle) * normal).sum(1, keepdim=True)
         fast = closing.abs() >= config.closing_speed
         estimate = (-parting / torch.where(fast, closing, 1.0)).clamp(0.0, config.largest)
-        hits = (share * config.hits).clamp(max=config.hits - 1.0)  # older ones fade once there are that many
+        hits = (share * config.hits).clamp(max=config.hits - 1.0)  # with more hits, older ones fade
         weight = hits + config.prior_hits
         mean = (restitution * weight + estimate - config.prior) / (weight + 1.0)
         learned = torch.cat((mean, (hits + 1.0) / config.hits), dim=1)

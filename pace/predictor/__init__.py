@@ -1,6 +1,6 @@
-"""Where the ball will be: the physics-based forecast, and the learned network that the policy sees.
+"""Predicting the ball: the physics-based forecast, and the learned network behind the policy's observations.
 
-Here belong forecasts of the ball and how the network is fitted; not what the robot makes of them (``onboard``). Imports
+Forecasts of the ball and the network's regression belong here; the robot's use of them (``onboard``) does not. Imports
 ``sim`` and the rooms below. ``python -m pace.predictor`` trains the network alone.
 """
 
@@ -17,7 +17,7 @@ __all__ = ["BallPredictor", "Forecast", "PredictorNetwork", "forecast_flight"]
 
 
 def __getattr__(name: str) -> Any:
-    """Import on first use, so that the command answers at once."""
+    """Import on first use, so that the command starts fast."""
     if name == "forecast_flight":
         from pace.predictor.forecast import forecast_flight
 

@@ -1,10 +1,10 @@
 """Two parabolas through the whole flight so far, joined by the bounce: least squares with priors, on tensors.
 
-Before the bounce position, velocity and acceleration of each axis are fitted to every sensed position, after it again,
-starting from where and how fast the first parabola says that the ball leaves the table. Launch, gravity, drag and the
-table are priors, as wide as what differs from serve to serve and from ball to ball; what they get wrong the network
-behind it learns. Those of the serve come from the configuration (:class:`pace.config.task.PredictorPriors`). Only
-positions are used, so that a window that holds the whole flight is all the state there is.
+Position, velocity and acceleration of each axis are fitted to every sensed position before the bounce. A second fit
+covers the positions after it, starting from the first parabola's position and velocity at the table. Launch, gravity,
+drag and the table are priors, as wide as the variation over serves and balls; the network after the fit learns the
+residual. The serve's priors come from the configuration (:class:`pace.config.task.PredictorPriors`). Only positions are
+used, so a window over the whole flight is the entire state.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from pace.config.predictor import PredictorPriors
 UNIT = 0.4  # s; times in the fits are in this unit, so that the sums are of order one
 NOISE = 0.004  # m, standard deviation of a sensed position (uniform +-7 mm)
 CONTACT_HEIGHT = 0.78  # m, centre of a ball on the table
-LOW = 0.9  # m; a ball that turns up again below it has bounced: in 20 ms it falls 6 cm at most
-# A sensed position is up to 10 ms old, and linear between frames: around the bounce it lies on neither parabola.
+LOW = 0.9  # m; a ball that starts to rise below it has bounced: in 20 ms it falls 6 cm at most
+# A sensed position is up to 10 ms old, and linear between frames: around the bounce it is on neither parabola.
 AFTER_BOUNCE = 0.013  # s
-LEAST_GRAVITY = 5.0  # m/s^2 downwards, for what is no flight: a ball that rolls
+LEAST_GRAVITY = 5.0  # m/s^2 downwards, for a rolling ball, which does not fly
 SEEN = (1.0, 1.0, 1.0)  # m
-BOUNCE_WIDTH = ((0.003, 0.003, 0.003), (0.25, 0.06, 0.06))  # of position and velocity behind the bounce
+BOUNCE_WIDTH = ((0.003, 0.003, 0.003), (0.25, 0.06, 0.06))  # of position and velocity after the bounce
 RESTITUTION, FRICTION = 0.92, 0.225  # of the table, in the middle of all presets
 
 
@@ -38,7 +38,7 @@ class Parabola(NamedTuple):
     acceleration: Tensor
 
     def at(self, time: Tensor) -> Parabola:
-        """The same, seen from ``time`` (N, 1) s on."""
+        """The same with its time zero at ``time`` (N, 1) s."""
         position = self.position + time * (self.velocity + 0.5 * time * self.acceleration)
         return Parabola(position, self.velocity + time * self.acceleration, self.acceleration)
 
@@ -49,9 +49,9 @@ class Parabola(NamedTuple):
 
 
 class Flight(NamedTuple):
-    """What a window of positions says: ``age`` (N, 1) s since the first, ``before`` the parabola of the way to the
-    table at the newest frame, ``bounce_age`` (N, 1) s since the bounce (negative: still to come), ``after`` the
-    parabola behind the bounce from there on, ``seen`` (N, 1) frames on it."""
+    """The fit of a window of positions: ``age`` (N, 1) s since the first, ``before`` the parabola before the bounce at
+    the newest frame, ``bounce_age`` (N, 1) s since the bounce (negative: still to come), ``after`` the parabola from
+    the bounce on, ``seen`` (N, 1) frames on it."""
 
     age: Tensor
     before: Parabola
@@ -66,12 +66,12 @@ class Flight(NamedTuple):
 
     @property
     def apex(self) -> Tensor:
-        """(N, 3) m, where the second parabola is highest."""
+        """(N, 3) m, the highest point of the second parabola."""
         return self.after.at(self.apex_delay).position
 
 
 class Fit(nn.Module):
-    """Least squares of parabolas with priors, each axis by itself.
+    """Least squares of parabolas with priors, each axis separately.
 
     Args: width (3, 3) standard deviations of the prior, rows position m, velocity m/s,
     acceleration m/s^2, columns axes.
@@ -88,7 +88,7 @@ class Fit(nn.Module):
         self.register_buffer("prior", torch.diag_embed(precision.T), persistent=False)  # (axis, 3, 3)
 
     def forward(self, time: Tensor, weight: Tensor, position: Tensor, mean: Parabola) -> Parabola:
-        """Time (N, W) s, weight (N, W) 1 where a position counts, else 0, position (N, 3, W) m, the prior's mean."""
+        """Time (N, W) s, weight (N, W) 1 if a position counts, else 0, position (N, 3, W) m, the prior's mean."""
         centre = torch.stack(mean, dim=2) * self.scale  # (N, axis, 3)
         once = (time / UNIT).unsqueeze(1)
         twice = once.square()
@@ -125,12 +125,12 @@ class FlightFilter(nn.Module):
         self.register_buffer("means", means, persistent=False)
 
     def forward(self, frames: Tensor) -> Flight:
-        """(N, W, 3) m, oldest first, the first position repeated where the flight is shorter."""
+        """(N, W, 3) m, oldest first, the first position repeated if the flight is shorter."""
         frames = frames.mT.contiguous()
         ages = self.ages.expand(frames.shape[0], -1)
         moved = (frames[..., 1:] != frames[..., :-1]).any(1).to(frames.dtype)
         age = FRAME * moved.sum(1, keepdim=True)
-        # before the first low place from which it rises the ball has surely not bounced; at that place it may have
+        # the ball has not bounced before the first low position from which it rises; at that position it may have
         low, rises = frames[:, 2] < LOW, frames[:, 2, 1:] > frames[:, 2, :-1]
         turns = torch.cat([low[:, :-1] & rises, low[:, -1:]], dim=1).to(frames.dtype)
         turned, where = turns.max(1, keepdim=True)
@@ -146,14 +146,14 @@ class FlightFilter(nn.Module):
 
 
 def time_to_table(flight: Parabola) -> Tensor:
-    """(N, 1) s until a falling parabola is at the table, negative when it was there; its top when it never is."""
+    """(N, 1) s until a falling parabola reaches the table, negative if that is past; until its top if it never does."""
     speed, height = flight.velocity[:, 2:], flight.position[:, 2:] - CONTACT_HEIGHT
     under = speed.square() + 2.0 * flight.gravity * height
     return (speed + under.clamp(min=0.0).sqrt()) / flight.gravity
 
 
 def rebound(velocity: Tensor) -> Tensor:
-    """Velocity (N, 3) m/s behind a sliding bounce without spin, of the middle of all tables."""
+    """Velocity (N, 3) m/s after a sliding bounce without spin, of the middle of all tables."""
     push = (1.0 + RESTITUTION) * velocity[:, 2:].abs()
     along = velocity[:, :2]
     speed = along.square().sum(1, keepdim=True).sqrt().clamp(min=1e-3)

@@ -1,4 +1,4 @@
-"""The physics-based predictor as a plain function: where a flight bounces, peaks and lands."""
+"""The physics-based predictor as a plain function: bounce, apex and landing of a flight."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pace.sim.ball.ball import DEFAULT_PRESET, BallParams, BallSim, Forecast, ba
 
 @lru_cache
 def _ball_dt() -> float:
-    """s, the longest sub-step of a flight, as the engines' configurations have it."""
+    """s, the longest sub-step of a flight, from the engines' configurations."""
     solver = OmegaConf.load(config_dir() / "engine" / "_solver.yaml")
     return float(OmegaConf.select(solver, "ball_dt", throw_on_missing=True))
 
@@ -28,7 +28,7 @@ def forecast_flight(
     table: TableConfig | None = None,
     intercept_x: float = -1.6,
 ) -> Forecast:
-    """Fly N balls ahead among table, net and floor, through any paddle, and say what they meet.
+    """Simulate the flight of N balls ahead, with table, net and floor but without paddles, and return its events.
 
     Args:
         position: (N, 3) m, world frame (origin on the floor below the table's centre, x to the opponent, z up).
@@ -36,11 +36,11 @@ def forecast_flight(
         spin: (N, 3) rad/s; ``None`` is no spin.
         params: ball, air and contacts, numbers or tensors (N,); ``None`` is the preset of the default configuration.
         table: table, net and floor; ``None`` takes those of the same preset.
-        intercept_x: m, where :attr:`Forecast.intercept` is asked for.
+        intercept_x: m, of :attr:`Forecast.intercept`.
 
     Returns:
-        :class:`pace.sim.ball.Forecast`: tensors (N, ...) on the device of ``position``, in m and s from now, NaN where
-        there is none. The flight is the simulation's own.
+        :class:`pace.sim.ball.Forecast`: tensors (N, ...) on the device of ``position``, in m and s from now, NaN if an
+        event does not occur. The flight is that of the simulation.
 
     Errors: ``ValueError`` for another shape than (N, 3).
     """

@@ -1,8 +1,8 @@
 """The learned predictor: from the last sensed ball positions to the apex, the paddle's target and the time to it.
 
-``features: steps`` sees positions and nothing else (paper). For windows that hold the whole flight, ``counted`` sees
-the last five of them and how many there were, and ``flight`` fits two parabolas to all (:mod:`pace.predictor.filter`)
-and learns what these get wrong. Any other predictor is a :class:`BallPredictor`, from the package or from outside
+``features: steps`` takes positions alone (paper). For windows over the whole flight, ``counted`` takes the last five
+positions and their total number, and ``flight`` fits two parabolas to all (:mod:`pace.predictor.filter`) and learns the
+residual. Any other predictor is a :class:`BallPredictor`, from the package or from outside
 (:mod:`pace.config.plugins`).
 """
 
@@ -22,7 +22,7 @@ from pace.predictor.filter import FlightFilter
 OUTPUT_SIZES = {"apex": 3, "target": 3, "target_time": 1}
 
 COUNT_CENTRE, COUNT_SCALE = 20.0, 10.0  # frames since the launch
-# What the fit of a flight says of times, as numbers of order one (s; frames after the bounce).
+# Scales of the fit's times, to numbers of order one (s; frames after the bounce).
 AGE_CENTRE, AGE_SCALE, FRAMES_SCALE = 0.35, 0.25, 6.0
 LARGEST_FEATURE = 5.0
 
@@ -30,7 +30,7 @@ LARGEST_FEATURE = 5.0
 def predictor_slices(outputs: list[str]) -> dict[str, slice]:
     """Columns of each named part of the predictor's output.
 
-    Errors: :class:`ConfigError` for an unknown name, or when the apex is not among them.
+    Errors: :class:`ConfigError` for an unknown name, or if the apex is not among them.
     """
     unknown = [name for name in outputs if name not in OUTPUT_SIZES]
     if unknown or "apex" not in outputs:
@@ -40,7 +40,7 @@ def predictor_slices(outputs: list[str]) -> dict[str, slice]:
 
 
 class FlightFeatures(nn.Module):
-    """What the fit of a whole flight says, in numbers of order one: ``size`` of them."""
+    """Features of the fit of a whole flight: ``size`` numbers of order one."""
 
     centre: Tensor
     scale: Tensor
@@ -66,13 +66,13 @@ class FlightFeatures(nn.Module):
 
 
 class BallPredictor(nn.Module, ABC):
-    """A predictor that trains and plays: (N, 3 frames) ball positions -> (N, out), both in m and s, world frame.
+    """A predictor: (N, 3 frames) ball positions -> (N, out), both in m and s, world frame.
 
-    The frames are ordered from the oldest to the newest, 20 ms apart; before a ball has been seen so often, its first
-    position is repeated. Outputs stand in the order of ``config.outputs``; ``slices[name]`` finds them. The regression
-    compares them in units of their scales, which are priors.
+    The frames are ordered from the oldest to the newest, 20 ms apart; until a ball has been sensed so often, its first
+    position is repeated. Outputs are in the order of ``config.outputs``; ``slices[name]`` are their columns. The
+    regression compares them in units of their scales, which are priors.
 
-    Args: config: of the predictor, with priors (:func:`pace.predictor.priors.resolve_priors`); without, the measured.
+    Args: config: of the predictor, with priors (:func:`pace.predictor.priors.resolve_priors`); default: the measured.
     Errors: :class:`ConfigError` for unknown outputs, and fewer than two frames.
     """
 
@@ -94,13 +94,13 @@ class BallPredictor(nn.Module, ABC):
         self.register_scaling("output", Prior(mean, [value for name in self.outputs for value in known[name].std]))
 
     def register_scaling(self, name: str, prior: Prior) -> None:
-        """Buffers ``<name>_centre`` and ``<name>_scale``, which belong to the configuration and not to the weights."""
+        """Register buffers ``<name>_centre`` and ``<name>_scale``, which are configuration and not weights."""
         self.register_buffer(f"{name}_centre", torch.tensor(prior.mean), persistent=False)
         self.register_buffer(f"{name}_scale", torch.tensor(prior.std), persistent=False)
 
     @abstractmethod
     def scaled(self, positions: Tensor) -> Tensor:
-        """Outputs in units of their scales, (N, out): what the regression compares."""
+        """Outputs in units of their scales, (N, out), for the regression."""
 
     def scale_target(self, target: Tensor) -> Tensor:
         """True outputs (N, out), m and s -> units of their scales."""
@@ -114,11 +114,11 @@ class BallPredictor(nn.Module, ABC):
 class PredictorNetwork(BallPredictor):
     """MLP with ReLU over ``config.frames`` ball positions.
 
-    Inside, they become the newest position and the steps between frames, scaled: the same information, but the small
-    differences that carry the velocity are as large as the rest.
-    With ``config.features`` "counted" those are the last five, and the number of frames since the launch goes with
-    them: the window holds its first position over and over where the flight was shorter.
-    With "flight" they become a fit of the flight, and the MLP gives what its apex lacks.
+    The input is transformed to the newest position and the steps between frames, scaled: the same information, but the
+    small differences that carry the velocity are of order one too.
+    With ``config.features`` "counted" those are the last five, and the number of frames since the launch is added: the
+    window repeats its first position if the flight was shorter.
+    With "flight" the input is transformed to a fit of the flight, and the MLP outputs the correction of its apex.
     """
 
     position_centre: Tensor

@@ -1,9 +1,9 @@
-"""The predictor's priors for the serves of a task, carried over from those that they were measured on.
+"""The predictor's priors for the serves of a task, transferred from the serves that they were measured on.
 
-The defaults of :class:`pace.config.task.PredictorPriors` were measured on :data:`MEASURED_ON`. For other serves each
-mean moves by as much as the model of a flight in :mod:`pace.predictor.filter` says for the middle of the ranges, and
-each standard deviation grows or shrinks as that model's range over the corners of the ranges does. For the serves that
-they were measured on they are the defaults, to the last digit.
+The defaults of :class:`pace.config.task.PredictorPriors` were measured on :data:`MEASURED_ON`. For other serves, the
+flight model of :mod:`pace.predictor.filter` shifts each mean by its change for the middle of the ranges, and scales
+each standard deviation by the change of its range over the corners of the ranges. For the measured serves the priors
+equal the defaults, to the last digit.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from pace.config.predictor import FRAME_DT, PredictorConfig, PredictorPriors, Pr
 from pace.config.task import TaskConfig
 from pace.predictor.filter import Parabola, rebound, time_to_table
 
-NO_WIDTH = 1e-6  # what does not differ from serve to serve, but for rounding
-LEAST_SHARE = 0.5  # of a measured standard deviation: balls, tables and noise differ for one and the same serve, too
+NO_WIDTH = 1e-6  # smaller widths are rounding errors
+LEAST_SHARE = 0.5  # of a measured standard deviation: balls, tables and noise differ even for the same serve
 
 
 @dataclass(frozen=True)
 class Launches:
-    """Where serves begin, m and m/s, the step between sensed positions, s, and the x of the paddle's target, m."""
+    """Ranges of serves, m and m/s, the step between sensed positions, s, and the x of the paddle's target, m."""
 
     position: tuple[Range, Range, Range]
     velocity: tuple[Range, Range, Range]
@@ -47,7 +47,7 @@ MEASURED_ON = Launches(
 
 
 def resolve_priors(config: TaskConfig, learned: PredictorPriors | None = None) -> PredictorConfig:
-    """The predictor's configuration with priors: its own, those of weights that were ``learned``, or the serve's."""
+    """The predictor's configuration with priors: the given ones, those of ``learned`` weights, or the serve's."""
     found = config.predictor.priors or learned or derive_priors(Launches.of(config))
     return replace(config.predictor, priors=found)
 
@@ -77,7 +77,7 @@ def _middle_and_corners(launches: Launches) -> tuple[Tensor, Tensor]:
 
 
 def _flights(launch: Tensor, launches: Launches) -> dict[str, Tensor]:
-    """What the flights of ``launch`` (N, 6) are like, by the name of the prior, (N, 3) or (N, 1)."""
+    """Quantities of the flights of ``launch`` (N, 6), by the name of the prior, (N, 3) or (N, 1)."""
     measured, velocity = PredictorPriors(), launch[:, 3:]
     fall = _slowed(velocity, measured.fall, measured.launch_velocity)
     before = Parabola(launch[:, :3], velocity, fall)
@@ -89,7 +89,7 @@ def _flights(launch: Tensor, launches: Launches) -> dict[str, Tensor]:
     rise_time = rebounding[:, 2:] / after.gravity
     apex = after.at(rise_time).position
     target = torch.cat([torch.full_like(apex[:, :1], launches.target_x), apex[:, 1:]], dim=1)
-    level = torch.tensor([1.0, 1.0, 0.0])  # a serve goes down as far as it goes up
+    level = torch.tensor([1.0, 1.0, 0.0])  # a serve falls as far as it rises
     step = 0.5 * launches.control_dt * (velocity + rebounding) * level
     return {
         "launch_velocity": velocity,
@@ -101,7 +101,7 @@ def _flights(launch: Tensor, launches: Launches) -> dict[str, Tensor]:
         "step": step,
         "apex": apex,
         "target": target,
-        "target_time": 0.5 * (bounce_time + rise_time),  # half of the flight is left in the middle of it
+        "target_time": 0.5 * (bounce_time + rise_time),  # in the middle of the flight half of it is left
     }
 
 

@@ -1,4 +1,4 @@
-"""Online regression of the predictor on the rollout that was just played, and its error before it saw that rollout."""
+"""Online regression of the predictor on the last rollout, and its error on that rollout before the fit."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pace.config.predictor import PredictorConfig
-from pace.distributed import Team
+from pace.distributed import ProcessGroup
 from pace.predictor.network import BallPredictor
 from pace.runs.optimiser import load_optimiser_state, optimiser_state
 
@@ -29,8 +29,8 @@ class PredictorSource(Protocol):
 class PredictorTrainer:
     """Adam on a :class:`BallPredictor`, which it changes in place, over samples of the last (steps, N) rollout.
 
-    After ``config.train_updates`` updates the network is frozen (0: never); errors are measured all the same. The
-    processes of a ``team`` share the samples of a batch.
+    After ``config.train_updates`` updates the network is frozen (0: never); errors are still measured. The processes of
+    a ``group`` share the samples of a batch.
     """
 
     def __init__(
@@ -39,10 +39,10 @@ class PredictorTrainer:
         config: PredictorConfig,
         steps: int,
         num_worlds: int,
-        team: Team | None = None,
+        group: ProcessGroup | None = None,
     ) -> None:
         device = next(network.parameters()).device
-        self.network, self.config, self.team = network, config, team or Team()
+        self.network, self.config, self.group = network, config, group or ProcessGroup()
         self.updates = 0
         self.optimiser = torch.optim.Adam(network.parameters(), lr=config.learning_rate)
         self._num_worlds, self._device, self._first_steps = num_worlds, device, steps
@@ -50,7 +50,7 @@ class PredictorTrainer:
         self.resize(steps)
 
     def resize(self, steps: int) -> None:
-        """Take rollouts of ``steps`` from now on; an update then has batches in proportion."""
+        """Take rollouts of ``steps`` from now on; an update then has proportionally many batches."""
         worlds, device = self._num_worlds, self._device
         self.steps = steps
         self.inputs = torch.zeros(steps, worlds, self.network.input_size, device=device)
@@ -61,7 +61,7 @@ class PredictorTrainer:
 
     @property
     def frozen(self) -> bool:
-        """The network no longer changes."""
+        """Whether the network is frozen."""
         return not self.config.enabled or 0 < self.config.train_updates <= self.updates
 
     @torch.no_grad()
@@ -84,7 +84,7 @@ class PredictorTrainer:
     def errors(self) -> dict[str, float]:
         """RMSE of the apex (3-D, cm): ``predictor_rmse_cm``, and ``predictor_rmse_cm/<bin>`` by time before the apex.
 
-        A bin without a sample, and everything when the predictor is switched off, is NaN.
+        A bin without a sample is NaN; with the predictor switched off, all are.
         """
         names = ["predictor_rmse_cm", *(f"predictor_rmse_cm/{name}" for name in BIN_NAMES)]
         if not self.config.enabled:
@@ -97,35 +97,35 @@ class PredictorTrainer:
         sums = torch.zeros(2, len(BIN_NAMES), device=squared.device)
         sums[0].index_add_(0, bins, squared * weight)
         sums[1].index_add_(0, bins, weight)
-        self.team.sum_(sums)
+        self.group.all_reduce_sum_(sums)
         totals = torch.cat([sums.sum(1, keepdim=True), sums], dim=1)
         return dict(zip(names, (100.0 * (totals[0] / totals[1]).sqrt()).tolist(), strict=True))
 
     def _fit(self) -> None:
         """``batches_per_update`` steps of Adam, more for longer rollouts, on valid samples.
 
-        They are drawn with replacement and without a host sync.
+        They are sampled with replacement and without a host sync.
         """
         inputs, targets = self.inputs.flatten(0, 1), self.targets.flatten(0, 1)
         valid = self.valid.flatten()
         by_validity = torch.argsort(valid, descending=True, stable=True)
         count = valid.sum()
-        rows = max(1, self.config.batch_size // self.team.size)
+        rows = max(1, self.config.batch_size // self.group.size)
         for _ in range(self._batches):
             draw = torch.rand(rows, device=valid.device)
             index = by_validity[(draw * count).long()]
             error = self.network.scaled(inputs[index]) - self.network.scale_target(targets[index])
-            loss = (error.square().mean(1) * valid[index]).mean()  # zero where the rollout had no valid sample at all
+            loss = (error.square().mean(1) * valid[index]).mean()  # zero if the rollout had no valid sample
             self.optimiser.zero_grad(set_to_none=True)
             loss.backward()
-            self.team.mean_([p.grad for p in self.network.parameters() if p.grad is not None])
+            self.group.all_reduce_mean_([p.grad for p in self.network.parameters() if p.grad is not None])
             self.optimiser.step()
 
     def state_dict(self) -> dict[str, Any]:
-        """Adam's moments and the count of updates; the network's weights are kept with the policy's."""
+        """Adam's moments and the count of updates; the network's weights are saved with the policy's."""
         return {"updates": self.updates, **optimiser_state(self.optimiser)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` gave."""
+        """Restore the result of :meth:`state_dict`."""
         self.updates = int(state["updates"])
         load_optimiser_state(self.optimiser, state)

@@ -1,6 +1,6 @@
-"""How a policy learns: networks, rollouts, PPO, the training loop, and loading what was trained.
+"""Learning a policy: networks, rollouts, PPO, the training loop, and loading a trained policy.
 
-Here belongs the learner; not the task that it learns (``task``), nor how well it plays (``evaluation``). Imports
+The learner belongs here; the task that it learns (``task``) and its evaluation (``evaluation``) do not. Imports
 ``task``, ``predictor``, ``runs`` and the rooms below. ``python -m pace.rl.train`` trains.
 """
 

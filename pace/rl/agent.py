@@ -1,4 +1,4 @@
-"""Actor and critic: observation normalisation, the two networks, and the Gaussian policy with its bounded spread."""
+"""Actor and critic: observation normalisation, the two networks, and the Gaussian policy with its bounded std."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from torchrl.modules import IndependentNormal
 
 from pace.config.base import ConfigError
 from pace.config.training import AlgoConfig, SchedulePoint
-from pace.distributed import Team
+from pace.distributed import ProcessGroup
 
 SMALLEST_STD = 1e-4  # the scale module's own lower bound
-VARIANCE_FLOOR = 1e-4  # observations that hardly vary are not blown up: the divisor is at least 0.01
+VARIANCE_FLOOR = 1e-4  # the divisor is at least 0.01, so that nearly constant observations stay small
 
 
 def scheduled(points: Sequence[SchedulePoint], samples: float) -> float:
@@ -38,7 +38,7 @@ def scheduled(points: Sequence[SchedulePoint], samples: float) -> float:
 
 
 def compute_dtype(autocast: str, device: torch.device) -> torch.dtype:
-    """Number format of the matrix products: bf16 where asked for, or (``auto``) where the hardware has it."""
+    """Number format of the matrix products: bf16 if configured, or (``auto``) if the hardware supports it."""
     if autocast == "bf16":
         return torch.bfloat16
     if autocast == "fp32":
@@ -60,8 +60,8 @@ class RunningNorm(nn.Module):
     """Running mean and variance of an observation, and the clipped standard score by them.
 
     The moments of batches are merged in float64 (Chan et al. 1979), so that a long run neither drifts nor saturates.
-    A batch with a NaN or an infinity is left out of them and clears ``finite``, the run's cheap check. Without
-    ``learns`` the moments stay 0 and 1: an observation is clipped in its own units.
+    A batch with a NaN or an infinity is skipped and clears ``finite``, the run's cheap check. Without ``learns`` the
+    moments stay 0 and 1: an observation is clipped in its own units.
     """
 
     count: Tensor
@@ -97,9 +97,9 @@ class RunningNorm(nn.Module):
         delta = batch_mean.double() - self.mean
         total = self.count + batch
         share = batch / total
-        spread = self.var * (1.0 - share) + batch_var * share + delta.square() * (share * (1.0 - share))
+        merged = self.var * (1.0 - share) + batch_var * share + delta.square() * (share * (1.0 - share))
         self.mean.copy_(torch.where(finite, self.mean + delta * share, self.mean))
-        self.var.copy_(torch.where(finite, spread, self.var))
+        self.var.copy_(torch.where(finite, merged, self.var))
         self.count.copy_(torch.where(finite, total, self.count))
         self.finite.logical_and_(finite)
         self._refresh()
@@ -109,18 +109,18 @@ class RunningNorm(nn.Module):
         return self.count.clone(), self.mean.clone(), self.var.clone()
 
     @torch.no_grad()
-    def pool(self, before: tuple[Tensor, Tensor, Tensor], team: Team) -> None:
-        """Make one set of moments of what each process of ``team`` has merged since all had the moments ``before``.
+    def pool(self, before: tuple[Tensor, Tensor, Tensor], group: ProcessGroup) -> None:
+        """Merge the batches of all processes of ``group`` since they had the moments ``before``.
 
-        In powers about the old mean, what a process saw is a plain difference of sums, and those add up.
+        In powers about the old mean, the batches of a process are a plain difference of sums, and sums add up.
         """
-        if team.size == 1 or not self.learns:
+        if group.size == 1 or not self.learns:
             return
         count, mean, var = before
         shift = self.mean - mean
         first = self.count * shift
         second = self.count * (self.var + shift.square()) - count * var
-        seen = team.sum_(torch.cat(((self.count - count).view(1), first, second)))
+        seen = group.all_reduce_sum_(torch.cat(((self.count - count).view(1), first, second)))
         self.count.copy_(count + seen[0])
         shift = seen[1 : self.size + 1] / self.count
         self.mean.copy_(mean + shift)
@@ -216,16 +216,16 @@ class Agent(nn.Module):
         self.to(device)
 
     def choose_dtype(self) -> None:
-        """Compute in float32 once the policy's spread is so small that rounding to bf16 is a good part of it.
+        """Compute in float32 once the policy's std is so small that rounding to bf16 is comparable to it.
 
-        What is rounded differs with every change of the weights: the KL divergence of an update then measures the
-        rounding, and the learning rate, which follows it, falls to its floor.
+        The rounding errors differ with every change of the weights: the KL divergence of an update then measures the
+        rounding, and the learning rate, which follows the KL divergence, falls to its floor.
         """
         fine = self.actor.std.mean().item() < self.fp32_below
         self.observation_dtype = self.actor.mlp.dtype = self.critic.dtype = torch.float32 if fine else self.fast_dtype
 
     def actor_operator(self) -> ProbabilisticTensorDictSequential:
-        """The actor as TorchRL sees it: normalised ``policy`` -> ``loc``, ``scale`` -> ``action``."""
+        """The actor as a TorchRL module: normalised ``policy`` -> ``loc``, ``scale`` -> ``action``."""
         return ProbabilisticTensorDictSequential(  # type: ignore[call-overload]
             TensorDictModule(self.actor, in_keys=["policy"], out_keys=["loc", "scale"]),  # type: ignore[arg-type]
             ProbabilisticTensorDictModule(  # type: ignore[arg-type]
@@ -238,7 +238,7 @@ class Agent(nn.Module):
         )
 
     def critic_operator(self) -> TensorDictModule:
-        """The critic as TorchRL sees it: normalised ``critic`` -> ``state_value`` (..., 1)."""
+        """The critic as a TorchRL module: normalised ``critic`` -> ``state_value`` (..., 1)."""
         return TensorDictModule(self.critic, in_keys=["critic"], out_keys=["state_value"])
 
 

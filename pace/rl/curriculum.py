@@ -1,4 +1,4 @@
-"""Tasks that follow one another in a run: worlds are made anew where a stage of the curriculum begins."""
+"""Tasks that follow one another in a run: the worlds are rebuilt when a stage of the curriculum begins."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ Worlds = TypeVar("Worlds")
 
 
 class Curriculum(Generic[Worlds]):
-    """Makes the worlds of each stage; the networks and everything learned stay.
+    """Makes the worlds of each stage; the networks and all other learned state stay.
 
     Args:
-        config: of the run; its task is the first stage, and ``config.curriculum`` has the others.
+        config: of the run; its task is the first stage, ``config.curriculum`` has the others.
         make: worlds of a task, given its configuration and the number of the stage, 0 for the first.
         samples: control steps of the run so far; :attr:`worlds` are made for the stage that they are in.
 
-    Attributes: ``tasks`` the configuration of each stage; ``stage`` the present one, ``worlds`` those made for it.
-    Errors: :class:`ConfigError` for changes that the task does not know, which names the stage.
+    Attributes: ``tasks`` the configuration of each stage; ``stage`` the current one, ``worlds`` those made for it.
+    Errors: :class:`ConfigError`, which names the stage, for changes of unknown keys.
     """
 
     def __init__(self, config: TrainConfig, make: Callable[[TrainConfig, int], Worlds], samples: float) -> None:

@@ -1,4 +1,4 @@
-"""A saved policy in one line, together with the task that it was trained for."""
+"""Loading a saved policy together with its task."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from pace.task.observations import POLICY, width
 if TYPE_CHECKING:
     from pace.task.env import TableTennisEnv
 PRETRAINED = "pretrained"  # folder of published policies, beside configs/
-RANDOM_STD = 0.8  # of the random policy's actions: how widely a training run begins to explore
+RANDOM_STD = 0.8  # of the random policy's actions: the first std of a training run
 
 
 @dataclass(frozen=True)
 class TaskPolicy:
-    """A policy, callable with the raw ``policy`` observation (N, Dp), and what it was trained on.
+    """A policy, callable with the raw ``policy`` observation (N, Dp), and its task.
 
     Attributes: ``config`` as saved; ``act`` the function behind the call; ``predictor`` the network that the actor's
     predicted observations come from (``None``: zeros); ``source`` the checkpoint's folder, or the built-in's name;
@@ -69,7 +69,7 @@ class TaskPolicy:
         Without ``rewards`` none is computed (it is 0), and the saved reward's terms need not be known.
 
         ``overrides`` are those of :func:`override_task`, such as ``["serve=mixed", "engine.physics_dt=0.002"]``.
-        Errors: :class:`ConfigError` for a wrong key or value, an engine or a device that is not there.
+        Errors: :class:`ConfigError` for a wrong key or value, or for a missing engine or device.
         """
         from pace.task.env import TableTennisEnv  # loads the simulation, which takes seconds
 
@@ -93,8 +93,8 @@ def load_policy(path: str | Path, device: str | torch.device = "cpu") -> TaskPol
     Nothing in the files is executed or unpickled. A module that an import path in the configuration names is not
     imported unless the user has named it: :func:`pace.config.plugins.use`.
 
-    Errors: :class:`CheckpointError` for a folder that is no run, another format, a missing, reshaped or broken tensor,
-    and a configuration of another version.
+    Errors: :class:`CheckpointError` for a folder without a checkpoint, another format, a missing, reshaped or broken
+    tensor, and a configuration of another version.
     """
     checkpoint = load_checkpoint(locate(path), weights_only=True)
     config, source = saved_config(checkpoint), str(checkpoint.path)
@@ -122,7 +122,7 @@ def _load_predictor(checkpoint: Checkpoint, config: PredictorConfig) -> BallPred
 
 @contextmanager
 def _outside_named(source: str) -> Iterator[None]:
-    """Errors: :class:`CheckpointError` for what ``source`` needs from outside of pace, and the user has not named."""
+    """Errors: :class:`CheckpointError` if ``source`` needs a module outside of pace that the user has not named."""
     try:
         yield
     except ConfigError as error:
@@ -132,8 +132,8 @@ def _outside_named(source: str) -> Iterator[None]:
 def locate(path: str | Path) -> Path:
     """``path``, or the one of that name beside the package's ``configs/`` (so that ``pretrained/<name>`` is found).
 
-    Errors: :class:`CheckpointError` for a file that is no part of a checkpoint, and for a ``pretrained/<name>`` that is
-    not there, with those that are.
+    Errors: :class:`CheckpointError` for a file that is no part of a checkpoint, and, with the existing names, for a
+    missing ``pretrained/<name>``.
     """
     path = Path(path)
     if not path.exists() and not path.is_absolute() and (config_dir().parent / path).exists():
@@ -147,7 +147,7 @@ def locate(path: str | Path) -> Path:
 
 
 def saved_config(checkpoint: Checkpoint) -> TrainConfig:
-    """The configuration that a checkpoint was trained with last: its task is that of the curriculum's stage.
+    """The configuration at the end of a checkpoint's training: its task is that of the curriculum's stage.
 
     Errors: :class:`CheckpointError` when this version of pace does not know its keys.
     """
@@ -174,9 +174,9 @@ def _part(checkpoint: Checkpoint, name: str) -> dict[str, Tensor]:
 
 
 def built_in_policy(name: str, seed: int, like: TaskPolicy | None = None, device: str = "cpu") -> TaskPolicy:
-    """``zero``: holds the nominal pose; ``random``: actions N(0, 0.8), new at each step.
+    """``zero``: holds the nominal pose; ``random``: actions N(0, 0.8), resampled at each step.
 
-    It plays the task of ``like``, or the default one, and sees what that predicts.
+    Its task and predictor are those of ``like``, or the default ones.
     """
     from pace.config.training import load_train_config
 

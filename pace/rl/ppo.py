@@ -17,7 +17,7 @@ from torchrl.objectives import ClipPPOLoss, KLAdaptiveLR
 from pace.arrays.state import under_prefix
 from pace.config.base import ConfigError
 from pace.config.training import AlgoConfig
-from pace.distributed import Team
+from pace.distributed import ProcessGroup
 from pace.rl.agent import Agent, Policy, RunningNorm, Sizes, scheduled
 from pace.rl.rollout import Rollout, RolloutError, VectorTask
 from pace.runs.checkpoint import load_weights
@@ -37,8 +37,8 @@ METRICS = ("kl", "grad_norm_actor", "grad_norm_critic", *LOSS_METRICS)
 class PPOLoss(ClipPPOLoss):
     """ClipPPOLoss that also reports the exact mean KL divergence between the two Gaussians.
 
-    The loss's own ``kl_approx`` is a mean of log-ratios: its noise over a small minibatch is a good part of the KL
-    target, and it can be negative, which the learning-rate schedule ignores.
+    The loss's ``kl_approx`` is a mean of log-ratios: over a small minibatch its noise is comparable to the KL target,
+    and it can be negative, which the learning-rate schedule ignores.
     """
 
     kl: Tensor
@@ -55,11 +55,11 @@ class PPOLoss(ClipPPOLoss):
 class PPO:
     """Learner of an :class:`Agent`: one optimiser, gradient bound and parameter set each for actor and critic.
 
-    The processes of a ``team`` learn from the union of their rollouts: gradients, KL and metrics are means over them.
+    The processes of a ``group`` learn from the union of their rollouts: gradients, KL and metrics are means over them.
     """
 
-    def __init__(self, agent: Agent, config: AlgoConfig, team: Team | None = None) -> None:
-        self.agent, self.config, self.team = agent, config, team or Team()
+    def __init__(self, agent: Agent, config: AlgoConfig, group: ProcessGroup | None = None) -> None:
+        self.agent, self.config, self.group = agent, config, group or ProcessGroup()
         self.loss = PPOLoss(
             agent.actor_operator(),
             agent.critic_operator(),
@@ -85,7 +85,7 @@ class PPO:
     def update(self, rollout: Rollout, samples: float) -> dict[str, float]:
         """Learn from one rollout, ``samples`` control steps into the run; returns the means of the update's metrics.
 
-        Errors: :class:`RolloutError` when a loss is not finite; the weights are then not to be saved.
+        Errors: :class:`RolloutError` if a loss is not finite; the weights must then not be saved.
         """
         self.loss.get_buffer("entropy_coeff").fill_(scheduled(self.config.entropy, samples))
         self.schedule.target_kl = scheduled(self.config.kl_target, samples)
@@ -100,7 +100,7 @@ class PPO:
                 totals.append(self._learn(batch))
         self.agent.actor.bound_std(self.config.std_floor, scheduled(self.config.std, samples))
         mean = torch.stack(totals).mean(0)
-        self.team.mean_([mean])
+        self.group.all_reduce_mean_([mean])
         metrics: dict[str, float] = dict(zip(METRICS, mean.tolist(), strict=True))
         self._require_finite(metrics)
         metrics["lr"] = self.schedule.get_last_lr()[0]
@@ -113,9 +113,9 @@ class PPO:
         self.critic_optimiser.zero_grad(set_to_none=True)
         out = self.loss(batch)
         (out["loss_objective"] + out["loss_entropy"]).backward()
-        receive_actors = self.team.mean_later([self.loss.kl, *gradients(self.actor_parameters)])
-        out["loss_critic"].backward()  # while the actor's gradients travel; the critic's do while the actor learns
-        receive_critics = self.team.mean_later(gradients(self.critic_parameters))
+        receive_actors = self.group.all_reduce_mean_later([self.loss.kl, *gradients(self.actor_parameters)])
+        out["loss_critic"].backward()  # overlaps with the all-reduce of the actor's gradients, and vice versa below
+        receive_critics = self.group.all_reduce_mean_later(gradients(self.critic_parameters))
         receive_actors()
         kl = self.loss.kl.item()
         if not math.isfinite(kl):
@@ -134,9 +134,9 @@ class PPO:
         steps = rollout.steps
         advantage = rollout.advantage.view(-1, 1)
         mean = advantage.mean()
-        self.team.mean_([mean])
+        self.group.all_reduce_mean_([mean])
         variance = (advantage - mean).square().mean()
-        self.team.mean_([variance])
+        self.group.all_reduce_mean_([variance])
         return {
             "policy": rollout.policy.flatten(0, 1),
             "critic": rollout.critic[:steps].flatten(0, 1),
@@ -149,7 +149,7 @@ class PPO:
         }
 
     def _buffers(self, rollout: Rollout) -> TensorDict:
-        """The minibatch that all gathers write into; allocated at the first update from that storage."""
+        """The minibatch buffers that all gathers write into; allocated at the first update from that storage."""
         if self._minibatch is None or self._minibatch[0] is not rollout:
             rows = rollout.steps * rollout.num_worlds // self.config.minibatches
             if rows < 1:
@@ -177,7 +177,7 @@ class PPO:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` gave."""
+        """Restore the result of :meth:`state_dict`."""
         load_optimiser_state(self.actor_optimiser, state["actor_optimiser"])
         load_optimiser_state(self.critic_optimiser, state["critic_optimiser"])
 
@@ -195,13 +195,13 @@ class AsymmetricPPO:
 
     rollout: Rollout | None = None
 
-    def __init__(self, sizes: Sizes, config: AlgoConfig, device: torch.device, team: Team) -> None:
-        self.config, self.team = config, team
+    def __init__(self, sizes: Sizes, config: AlgoConfig, device: torch.device, group: ProcessGroup) -> None:
+        self.config, self.group = config, group
         self.agent = Agent(*sizes, config, device)
-        self.ppo = PPO(self.agent, config, team)
+        self.ppo = PPO(self.agent, config, group)
 
     def prepare(self, env: VectorTask, samples: float) -> int:
-        """Storage for these worlds, the steps of ``algo.later_steps``, and the networks' number format."""
+        """Allocate storage for these worlds, apply ``algo.later_steps``, and choose the networks' number format."""
         steps, old = self.config.steps_at(samples), self.rollout
         self.agent.choose_dtype()
         fits = old is not None and old.env is env and old.steps == steps
@@ -215,7 +215,7 @@ class AsymmetricPPO:
         return self.rollout
 
     def begin(self) -> None:
-        """Freeze the policy's standard deviation; note what the normalisers have seen."""
+        """Freeze the policy's standard deviation; copy the normalisers' moments."""
         self._moments = [norm.moments() for norm in self._norms()]
         self._stored.begin()
 
@@ -234,14 +234,14 @@ class AsymmetricPPO:
     def update(self, samples: float) -> dict[str, float]:
         """One set of normalisers for all processes, then :meth:`PPO.update`."""
         for norm, moments in zip(self._norms(), self._moments, strict=True):
-            norm.pool(moments, self.team)
+            norm.pool(moments, self.group)
         return self.ppo.update(self._stored, samples)
 
     def _norms(self) -> tuple[RunningNorm, RunningNorm]:
         return self.agent.policy_norm, self.agent.critic_norm
 
     def weights_loaded(self, new_run: bool) -> None:
-        """A new run begins with its own standard deviation."""
+        """A new run begins with the standard deviation of its configuration."""
         if new_run:
             self.agent.actor.bound_std(self.config.std_floor, self.config.std[0].value)
         self.agent.choose_dtype()
@@ -259,7 +259,7 @@ class AsymmetricPPO:
         return self.ppo.state_dict()
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` gave."""
+        """Restore the result of :meth:`state_dict`."""
         self.ppo.load_state_dict(state)
 
     @staticmethod

@@ -1,4 +1,4 @@
-"""Serves without a robot, for the predictor to practise on."""
+"""Serves without a robot, to train the predictor."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from pace.task.resets import ServeSampler
 SPREAD_STEPS = 50  # control steps, about as long as a serve
 
 
-STANDING = (-1.8, 0.0, 0.7)  # m, base of a robot that does not fall and plays no part
+STANDING = (-1.8, 0.0, 0.7)  # m, base of a robot that stands still
 
 
-FAR_AWAY = 100.0  # m, where the paddle is that nobody holds
+FAR_AWAY = 100.0  # m, position of a paddle that no ball meets
 
 
 class ServePractice:
@@ -70,14 +70,14 @@ class ServePractice:
         return Randomizer(config.randomization, config.ball, unused, ball, self.generator, model.nv, control_dt)
 
     def spread(self) -> None:
-        """Begin serves at random times, so that every rollout holds all stretches of a flight; they began together."""
+        """Desynchronise the serves, which began together: every rollout then holds all parts of a flight."""
         first = torch.randint(SPREAD_STEPS, (self.config.num_worlds,), generator=self.generator, device=self.device)
         for step in range(SPREAD_STEPS):
             self.advance(first == step)
 
     @torch.no_grad()
     def advance(self, also: Tensor | None = None) -> None:
-        """One control step; a serve that is over is followed by the next, with another ball and another delay, as are
+        """One control step. A new serve, with another ball and another delay, replaces each serve that is over, and
         those of ``also`` (N,) bool."""
         self.ball.fly(self._path)
         self._game.judge()
@@ -88,7 +88,7 @@ class ServePractice:
 
     def _serve(self, mask: Tensor) -> None:
         ball, wide = self.ball, mask.unsqueeze(-1)
-        self._randomizer.draw(mask)
+        self._randomizer.sample(mask)
         launch = self._serves.sample(mask)
         for value, start in zip((ball.position, ball.velocity, ball.spin), launch, strict=True):
             value.copy_(torch.where(wide, start, value))

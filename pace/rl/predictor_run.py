@@ -27,7 +27,7 @@ from pace.runs.progress import Progress
 from pace.runs.run_folder import METRICS, RunFolder, default_folder
 
 RESULT = "predictor.json"
-FINAL_ROLLOUTS = 20  # rollouts of the final measurement, which are never fitted
+FINAL_ROLLOUTS = 20  # rollouts of the final measurement, not used for training
 
 
 class PredictorRun:
@@ -52,14 +52,14 @@ class PredictorRun:
             self.trainer.record(t, self.practice)
 
     def slow_down(self, done: float) -> None:
-        """Learning rate for the share ``done`` of the way: half a cosine, to a hundredth of ``learning_rate``."""
+        """Learning rate for the share ``done`` of the run: half a cosine, to a hundredth of ``learning_rate``."""
         factor = 0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * done))
         for group in self.trainer.optimiser.param_groups:
             group["lr"] = factor * self.config.predictor.learning_rate
 
     def train(self, run: RunFolder) -> dict[str, float]:
-        """Fit rollout after rollout, each measured before it is fitted, to the end or to the first Ctrl-C or SIGTERM;
-        returns updates, samples and seconds."""
+        """Fit rollout after rollout, to the end or to the first Ctrl-C or SIGTERM; each is measured before its fit.
+        Returns updates, samples and seconds."""
         config, per_update = self.config, self.config.num_worlds * self.config.algo.steps
         progress = Progress(config.progress, config.samples, 60.0 * config.minutes, shown=["predictor_rmse_cm"])
         started = last = time.monotonic()
@@ -79,7 +79,7 @@ class PredictorRun:
         return {"updates": update, "samples": update * per_update, "wall_s": last - started}
 
     def measure(self) -> dict[str, float]:
-        """RMSE in cm, root of the mean square over rollouts that are not fitted; NaN bins are left out."""
+        """RMSE in cm, root of the mean square over rollouts that are not fitted, without NaN bins."""
         squares: dict[str, list[float]] = {}
         for _ in range(FINAL_ROLLOUTS):
             self.play()

@@ -1,4 +1,4 @@
-"""Rates of a rollout, from the sums that the worlds keep."""
+"""Rates of a rollout, from the sums over the worlds."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ import math
 import torch
 from torch import Tensor
 
-from pace.distributed import Team
+from pace.distributed import ProcessGroup
 
 COUNTS = ("serves", "hits", "successes", "falls", "episodes", "steps", "reward_sum")
 
 
-def summarise(statistics: dict[str, Tensor], control_dt: float, team: Team | None = None) -> dict[str, float]:
-    """Rates of the last rollout from the environments' sums over the ``team``; NaN where nothing was counted.
+def summarise(statistics: dict[str, Tensor], control_dt: float, group: ProcessGroup | None = None) -> dict[str, float]:
+    """Rates of the last rollout from the environments' sums over the ``group``; NaN if nothing was counted.
 
     ``hit_rate`` and ``success_rate`` are shares of the serves that ended, ``fall_rate`` is falls per second of a
     world's time, rewards are means per control step, and every other sum is given per serve.
     """
-    total = (team or Team()).sum_(torch.stack([value.float() for value in statistics.values()]))
+    total = (group or ProcessGroup()).all_reduce_sum_(torch.stack([value.float() for value in statistics.values()]))
     sums = dict(zip(statistics, total.tolist(), strict=True))
 
     def share(name: str, of: str) -> float:

@@ -1,9 +1,9 @@
-"""Playing the worlds for one update, into storage that is allocated once.
+"""The rollout of one update, in storage that is allocated once.
 
-DESIGN decision 5 names TorchRL's Collector. Its overhead was measured at 21 ms a control step for 1,024 worlds, more
-than the physics costs; this loop drives the same environment through its in-place interface instead, and hands the
-result to TorchRL's GAE and ClipPPOLoss. Observations are normalised and stored once, in the number format of the
-networks: what the policy acted on is bit for bit what it learns from.
+TorchRL's Collector costs 21 ms a control step for 1,024 worlds, more than the physics. This loop calls the same
+environment through its in-place interface instead, and passes the result to TorchRL's GAE and ClipPPOLoss. Observations
+are normalised and stored once, in the number format of the networks: the policy learns from bit for bit the same
+numbers that it acted on.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ CRITIC_ROWS = 8192  # rows of one critic pass after the rollout: bounds the memo
 
 
 class RolloutError(RuntimeError):
-    """Training cannot go on with what the worlds returned; the message says which world and which quantity."""
+    """Training cannot continue with a value of the worlds; the message names the world and the quantity."""
 
 
 class VectorTask(Protocol):
@@ -54,7 +54,7 @@ class TrainableTask(VectorTask, PredictorSource, Protocol):
         ...
 
     def warn_of_overflow(self) -> None:
-        """Warn, once, of worlds that the engine had no room for. May wait for the device."""
+        """Warn, once, of worlds whose contacts exceeded the engine's memory. May wait for the device."""
         ...
 
     def state_dict(self) -> dict[str, Any]:
@@ -62,7 +62,7 @@ class TrainableTask(VectorTask, PredictorSource, Protocol):
         ...
 
     def load_state_dict(self, state: dict[str, Any], /) -> None:
-        """Restore what :meth:`state_dict` gave."""
+        """Restore the result of :meth:`state_dict`."""
         ...
 
 
@@ -98,13 +98,13 @@ class Rollout:
 
     @torch.no_grad()
     def begin(self) -> None:
-        """Freeze the policy's spread for this rollout; call it before the first :meth:`step`."""
+        """Freeze the policy's standard deviation for this rollout; call it before the first :meth:`step`."""
         self.scale.copy_(self.agent.actor.std)
         self._last_critic.copy_(self.env.critic_observation)
 
     @torch.no_grad()
     def step(self, t: int) -> None:
-        """Observe, act, advance, reset: row ``t`` of the storage."""
+        """Observe, act, step, reset: row ``t`` of the storage."""
         env, agent = self.env, self.agent
         agent.policy_norm.update(env.policy_observation)
         agent.critic_norm.update(env.critic_observation)
@@ -138,7 +138,7 @@ class Rollout:
         self.estimate_advantage(gamma, gae_lambda)
 
     def estimate_advantage(self, gamma: float, gae_lambda: float) -> None:
-        """GAE from the stored values: a truncated step bootstraps from its own terminal state, a terminated one not."""
+        """GAE from the stored values. Truncated steps bootstrap from their terminal state, terminated ones do not."""
         terminal = self.value[self.steps + 1]
         next_value = torch.where(self.truncated, terminal, self.value[1 : self.steps + 1])
         done = self.terminated | self.truncated
@@ -149,7 +149,7 @@ class Rollout:
         self.value_target.copy_(target)
 
     def fault(self) -> str | None:
-        """What training cannot go on with: a value that is not finite, two truncations of one world. One host sync."""
+        """A fault that ends training: a value that is not finite, two truncations of one world. One host sync."""
         agent = self.agent
         finite = agent.policy_norm.finite & agent.critic_norm.finite
         finite = finite & torch.isfinite(self.reward).all() & torch.isfinite(self.value).all()
@@ -162,7 +162,7 @@ class Rollout:
         return None
 
     def _describe_fault(self) -> str:
-        """Where the first value that is not finite stands; only called when there is one."""
+        """Name and position of the first value that is not finite; only called if there is one."""
         parts: list[str] = []
         for name, values in (("policy", self.policy), ("critic", self.critic), ("reward", self.reward)):
             bad = (~torch.isfinite(values)).nonzero()

@@ -19,12 +19,12 @@ from pace.config.base import ConfigError, parse, to_dict
 from pace.config.predictor import PredictorPriors
 from pace.config.training import RESUME_KEYS, TrainConfig
 from pace.devices import resolve_device, threads_of
-from pace.distributed import Team, own_device, suitable_size, team_of
+from pace.distributed import ProcessGroup, own_device, process_group, suitable_size
 from pace.predictor.network import BallPredictor, make_predictor
 from pace.predictor.priors import resolve_priors
 from pace.rl.curriculum import Curriculum
 from pace.rl.policies import locate
-from pace.rl.trainer import Summary, Trainer, begins_anew, played_on
+from pace.rl.trainer import Summary, Trainer, device_type_of, restarts_worlds
 from pace.runs.checkpoint import Checkpoint, CheckpointError, load_checkpoint
 from pace.runs.progress import rate_texts
 from pace.runs.run_folder import CURVE, METRICS, RunFolder, default_folder
@@ -45,12 +45,12 @@ def train_from_config(composed: DictConfig) -> None:
     else:
         saved = None
     device = resolve_device(own_device(config.device))
-    if saved and device.type != played_on(saved) and not any(key.startswith("processes=") for key in overrides):
+    if saved and device.type != device_type_of(saved) and not any(key.startswith("processes=") for key in overrides):
         config.processes = 0  # as many as suit this kind of device
     config.processes = config.processes or suitable_size(config.num_worlds, device)
     arguments = overrides if hydra.mode == RunMode.MULTIRUN else None  # of this job; the command's are of all
-    with team_of(config.processes, device, arguments) as team:
-        trainer = build_trainer(config, saved, device, team)
+    with process_group(config.processes, device, arguments) as group:
+        trainer = build_trainer(config, saved, device, group)
         if trainer.run is not None:
             announce(trainer, trainer.run, saved)
         summary = trainer.train()
@@ -71,30 +71,30 @@ def resumed_config(saved: Checkpoint, path: str, overrides: list[str]) -> TrainC
     config = parse(OmegaConf.to_container(changed), TrainConfig)  # type: ignore[arg-type]
     config.resume, config.init_from, config.predictor_from = path, None, None
     if saved.counters["samples"] >= config.samples:
-        raise ConfigError(f"{path} has {saved.counters['samples']} samples: give samples= above that to go on")
+        raise ConfigError(f"{path} has {saved.counters['samples']} samples: give samples= above that to continue")
     if saved.path is not None:  # where the run lies now; it may have been moved or copied since it was saved
         config.out = str(saved.path.parent.parent)
     return config
 
 
-def build_trainer(config: TrainConfig, saved: Checkpoint | None, device: torch.device, team: Team) -> Trainer:
-    """Networks, this process's worlds and the leader's run folder; state from ``saved`` or :func:`first_weights`.
+def build_trainer(config: TrainConfig, saved: Checkpoint | None, device: torch.device, group: ProcessGroup) -> Trainer:
+    """Networks, this process's worlds and (on rank 0) the run folder; state from ``saved`` or :func:`first_weights`.
 
-    Errors: :class:`ConfigError` for worlds that the team cannot share equally.
+    Errors: :class:`ConfigError` if the process group cannot share the worlds equally.
     """
-    if config.num_worlds % team.size:
-        raise ConfigError(f"num_worlds {config.num_worlds} cannot be shared equally by {team.size} processes")
+    if config.num_worlds % group.size:
+        raise ConfigError(f"num_worlds {config.num_worlds} cannot be shared equally by {group.size} processes")
     start = first_weights(config)
     config.predictor = resolve_priors(config, learned_priors(start) if start else None)
     torch.manual_seed(config.seed)
     predictor = make_predictor(config.predictor).to(device)
-    anew = saved is not None and begins_anew(saved, team, device)
-    again = int(saved.counters["updates"]) if saved and anew else 0  # or the run's beginning would be drawn once more
-    make = partial(make_worlds, device=device, team=team, predictor=predictor, again=again)
+    new_worlds = saved is not None and restarts_worlds(saved, group, device)
+    offset = int(saved.counters["updates"]) if saved and new_worlds else 0  # else the samples of update 0 would repeat
+    make = partial(make_worlds, device=device, group=group, predictor=predictor, seed_offset=offset)
     curriculum = Curriculum(config, make, saved.counters["samples"] if saved else 0.0)
-    run = open_run(config, int(saved.counters["updates"]) if saved else 0) if team.leads else None
-    trainer = Trainer(config, curriculum.worlds, predictor, run, team, curriculum)
-    torch.manual_seed(team.seed(config.seed + again))  # the networks began alike, what is played does not
+    run = open_run(config, int(saved.counters["updates"]) if saved else 0) if group.is_rank_0 else None
+    trainer = Trainer(config, curriculum.worlds, predictor, run, group, curriculum)
+    torch.manual_seed(group.seed(config.seed + offset))  # the networks are equal on all ranks, the rollouts are not
     if saved:
         trainer.resume(saved)
     elif start:
@@ -103,22 +103,27 @@ def build_trainer(config: TrainConfig, saved: Checkpoint | None, device: torch.d
 
 
 def make_worlds(
-    task: TrainConfig, stage: int, device: torch.device, team: Team, predictor: BallPredictor, again: int = 0
+    task: TrainConfig,
+    stage: int,
+    device: torch.device,
+    group: ProcessGroup,
+    predictor: BallPredictor,
+    seed_offset: int = 0,
 ) -> TableTennisEnv:
-    """This process's worlds of one stage of the curriculum; each stage draws from random numbers of its own.
+    """This process's worlds of one stage of the curriculum; each stage has a separate seed.
 
-    ``again``: another number makes other draws, for worlds that begin anew in a run.
+    ``seed_offset`` is added to the seed, for worlds that are made from scratch within a run.
     """
     from pace.task.env import TableTennisEnv
 
-    threads = task.engine.threads or threads_of(team.size)
+    threads = task.engine.threads or threads_of(group.size)
     task = replace(task, engine=replace(task.engine, threads=threads))
-    seed = team.seed(task.seed + SEEDS_APART * stage + again)
-    return TableTennisEnv(task, task.num_worlds // team.size, device, seed, predictor)
+    seed = group.seed(task.seed + SEEDS_APART * stage + seed_offset)
+    return TableTennisEnv(task, task.num_worlds // group.size, device, seed, predictor)
 
 
 def first_weights(config: TrainConfig) -> Checkpoint | None:
-    """What a new run starts from: ``config.init_from`` with the predictor of ``config.predictor_from``, or one of them.
+    """A new run's first weights: ``config.init_from`` with the predictor of ``config.predictor_from``, or one of them.
 
     Errors: :class:`CheckpointError` for one that cannot be read.
     """
@@ -146,11 +151,11 @@ def open_run(config: TrainConfig, first_update: int) -> RunFolder:
 
 
 def announce(trainer: Trainer, run: RunFolder, saved: Checkpoint | None) -> None:
-    """Print what is about to be trained, on what, from what, and where it is kept."""
+    """Print the run's task, device, starting point and folder."""
     if saved is not None:
-        anew = ", with worlds that begin anew" if begins_anew(saved, trainer.team, trainer.device) else ""
-        print(f"going on from {saved.path}{anew}")
-    shared = f" in {trainer.team.size} processes" if trainer.team.size > 1 else ""
+        new_worlds = ", with new worlds" if restarts_worlds(saved, trainer.group, trainer.device) else ""
+        print(f"resuming from {saved.path}{new_worlds}")
+    shared = f" in {trainer.group.size} processes" if trainer.group.size > 1 else ""
     print(
         f"training {trainer.config.name}: {trainer.config.num_worlds} worlds on {trainer.device}{shared}, "
         f"{trainer.algorithm.describe()}, run folder {run.path}",

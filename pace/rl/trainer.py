@@ -1,4 +1,4 @@
-"""The training loop: play, check, fit the predictor, update the policy, log, save."""
+"""The training loop: roll out, check, fit the predictor, update the policy, log, save."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from pace.config.base import ConfigError, to_dict
 from pace.config.training import TrainConfig
-from pace.distributed import Team
+from pace.distributed import ProcessGroup
 from pace.predictor.network import BallPredictor
 from pace.predictor.regression import PredictorTrainer
 from pace.rl.agent import Sizes
@@ -35,7 +35,7 @@ from pace.runs.run_folder import RunFolder, plot_learning_curve
 
 CHECKPOINTS_KEPT = 4
 LAST_GOOD = "last_good"  # folder in the run: the weights before an update that failed
-LEARNER, OLD_LEARNER = "algorithm", "ppo"  # part of a checkpoint's training state, and what it was called once
+LEARNER, OLD_LEARNER = "algorithm", "ppo"  # part of a checkpoint's training state, and its former name
 
 
 @dataclass(frozen=True)
@@ -52,12 +52,12 @@ class Summary:
 
 
 class Trainer:
-    """Trains the agent and the predictor of ``config`` on ``env`` and keeps the run's files.
+    """Trains the agent and the predictor of ``config`` on ``env`` and writes the run's files.
 
-    How the agent acts and learns is the ``algorithm``'s part (``config.algo.algorithm``). ``predictor`` is the network
-    that ``env`` predicts with; it is trained in place. ``env`` holds this process's worlds; the processes of a ``team``
-    each have a trainer, go through every method together, and the leader has the ``run``. A ``curriculum`` gives other
-    worlds where another of its stages begins.
+    The ``algorithm`` (``config.algo.algorithm``) acts and learns. ``predictor`` is the network that ``env`` predicts
+    with; it is trained in place. ``env`` holds this process's worlds. Each process of a ``group`` has a trainer and
+    calls every method together with the others; only rank 0 has the ``run``. A ``curriculum`` replaces the worlds when
+    its next stage begins.
     """
 
     def __init__(
@@ -66,18 +66,18 @@ class Trainer:
         env: TrainableTask,
         predictor: BallPredictor,
         run: RunFolder | None,
-        team: Team | None = None,
+        group: ProcessGroup | None = None,
         curriculum: Curriculum[Any] | None = None,
     ) -> None:
         self.curriculum = curriculum
         self.config, self.env, self.predictor, self.run = config, env, predictor, run
-        self.team = team = team or Team()
+        self.group = group = group or ProcessGroup()
         self.device = env.policy_observation.device
         self.num_worlds, policy_size = env.policy_observation.shape
         sizes = Sizes(policy_size, env.critic_observation.shape[1], env.action_spec.shape[-1])
-        self.algorithm = ALGORITHMS[config.algo.algorithm](sizes, config.algo, self.device, team)
-        team.follow_([tensor for _, module in self._networks() for tensor in module.state_dict().values()])
-        self.regression = PredictorTrainer(predictor, config.predictor, config.algo.steps, self.num_worlds, team)
+        self.algorithm = ALGORITHMS[config.algo.algorithm](sizes, config.algo, self.device, group)
+        group.broadcast_([tensor for _, module in self._networks() for tensor in module.state_dict().values()])
+        self.regression = PredictorTrainer(predictor, config.predictor, config.algo.steps, self.num_worlds, group)
         self.updates, self.samples, self.wall_s = 0, 0, 0.0
         self._stop = StopRequest()
         self._saved_at = time.monotonic()
@@ -85,15 +85,15 @@ class Trainer:
     def train(self) -> Summary | None:
         """Run until ``samples``, ``minutes`` or a signal; writes checkpoints, metrics and the learning curve.
 
-        Returns what the leader of the team reports, and None in its other processes.
+        Returns the summary on rank 0, and None on the other ranks.
 
-        Errors: :class:`RolloutError` for values that are not finite; the weights before that update are then saved in
+        Errors: :class:`RolloutError` if values are not finite. The weights before that update are then saved in
         ``last_good/`` (for ``init_from``), and the last checkpoint stays the newest (for ``resume``).
         """
         config = self.config
         if self.samples >= config.samples:
             raise ConfigError(f"the run has {self.samples} samples and samples={config.samples:g}: nothing left to do")
-        shown = config.progress and self.team.leads
+        shown = config.progress and self.group.is_rank_0
         progress = Progress(shown, config.samples, 60.0 * config.minutes, self.samples)
         started = last = time.monotonic()
         wall_before, reason = self.wall_s, None
@@ -108,7 +108,7 @@ class Trainer:
                     progress.show(row)
                     if self.run is not None:
                         self.run.log(row)
-                    reason, due = self.team.decided((self._reason_to_end(now - started), self._save_is_due()))
+                    reason, due = self.group.broadcast_object((self._reason_to_end(now - started), self._save_is_due()))
                     if due or reason is not None:
                         self.save()
         finally:
@@ -140,28 +140,28 @@ class Trainer:
 
     @property
     def agent(self) -> nn.Module:
-        """All that the algorithm learns."""
+        """All networks that the algorithm trains."""
         return self.algorithm.agent
 
     @property
     def _samples_per_update(self) -> int:
-        return self.team.size * self.num_worlds * self.regression.steps
+        return self.group.size * self.num_worlds * self.regression.steps
 
     def _move_on(self) -> None:
-        """The next stage's worlds, where one begins; after an update, so that a checkpoint has what comes next."""
+        """Take the next stage's worlds if it begins; called after an update, so that a checkpoint holds them."""
         if self.curriculum is not None and self.curriculum.move_on(self.samples):
             self.env.warn_of_overflow()
             self.env = self.curriculum.worlds
 
     def update(self) -> dict[str, float]:
-        """One rollout and what is learned from it; returns the row of metrics, without the times."""
+        """One rollout and one training update on it; returns the row of metrics, without the times."""
         self._play()
         self._require_no_fault()
         prediction = self.regression.update()
         learning = self.algorithm.update(self.samples)
         self.samples += self._samples_per_update
         self.updates += 1
-        task = summarise(self.env.pop_statistics(), self.config.robot.control_dt, self.team)
+        task = summarise(self.env.pop_statistics(), self.config.robot.control_dt, self.group)
         if self.config.curriculum and self.curriculum is not None:
             task["stage"] = float(self.curriculum.stage)
         self._move_on()
@@ -179,8 +179,8 @@ class Trainer:
         self.algorithm.finish()
 
     def _require_no_fault(self) -> None:
-        """Errors: :class:`RolloutError`, in every process, when the rollout of one of them cannot be learned from."""
-        faults = [fault for fault in self.team.gather(self.algorithm.fault()) if fault is not None]
+        """Errors: :class:`RolloutError`, on every rank, if the rollout of one of them has a fault."""
+        faults = [fault for fault in self.group.gather(self.algorithm.fault()) if fault is not None]
         if faults:
             raise RolloutError(faults[0])
 
@@ -197,7 +197,7 @@ class Trainer:
         return time.monotonic() - self._saved_at >= 60.0 * self.config.checkpoint_minutes
 
     def save(self) -> None:
-        """Write a checkpoint of this moment and drop old ones."""
+        """Write a checkpoint of the current state and delete old ones."""
         self.env.warn_of_overflow()
         checkpoint = self.checkpoint()
         if self.run is not None:
@@ -206,7 +206,7 @@ class Trainer:
         self._saved_at = time.monotonic()
 
     def checkpoint(self) -> Checkpoint:
-        """Everything that the next update depends on, of all processes of the team."""
+        """Everything that the next update depends on, of all ranks."""
         env = {key: value.cpu() if isinstance(value, Tensor) else value for key, value in self.env.state_dict().items()}
         own = {"random": torch.get_rng_state(), "env": env}
         if self.device.type == "cuda":
@@ -218,12 +218,12 @@ class Trainer:
             training={
                 LEARNER: self.algorithm.state_dict(),
                 "regression": self.regression.state_dict(),
-                "processes": self.team.gather(own),
+                "processes": self.group.gather(own),
             },
         )
 
     def load_weights(self, checkpoint: Checkpoint) -> None:
-        """Take another run's policy, critic, normalisers and predictor over, or a predictor's weights alone.
+        """Load another run's policy, critic, normalisers and predictor, or a predictor's weights alone.
 
         Errors: :class:`CheckpointError` for a missing or reshaped tensor.
         """
@@ -243,10 +243,10 @@ class Trainer:
         self.algorithm.weights_loaded(new_run=True)
 
     def resume(self, checkpoint: Checkpoint) -> None:
-        """Go on exactly where ``checkpoint`` was written.
+        """Resume exactly from the state in ``checkpoint``.
 
-        Where :func:`begins_anew` says so, the worlds are those that the environment has just made. MuJoCo Warp on a GPU
-        adds up in no fixed order: there it goes on from the same state, and not bit for bit the same.
+        If :func:`restarts_worlds` is true, the worlds are the new ones of the environment. MuJoCo Warp on a GPU sums in
+        no fixed order: there a run resumes from the same state, but not bit for bit.
 
         Errors: :class:`CheckpointError` when it holds weights only or does not fit this configuration.
         """
@@ -258,31 +258,31 @@ class Trainer:
         try:
             self.algorithm.load_state_dict(state[LEARNER if LEARNER in state else OLD_LEARNER])
             self.regression.load_state_dict(state["regression"])
-            if not begins_anew(checkpoint, self.team, self.device):
-                self._resume_play(state["processes"][self.team.rank])
+            if not restarts_worlds(checkpoint, self.group, self.device):
+                self._resume_worlds(state["processes"][self.group.rank])
         except (KeyError, ValueError, RuntimeError) as error:
             raise CheckpointError(f"{checkpoint.path} does not fit this configuration: {error}") from error
         self.updates, self.samples = int(checkpoint.counters["updates"]), int(checkpoint.counters["samples"])
         self.wall_s = float(checkpoint.counters["wall_s"])
 
-    def _resume_play(self, own: dict[str, Any]) -> None:
-        """This process's worlds and random numbers, as :meth:`checkpoint` keeps them."""
+    def _resume_worlds(self, own: dict[str, Any]) -> None:
+        """Load this process's worlds and random number generators, as :meth:`checkpoint` saved them."""
         self.env.load_state_dict(own["env"])
         torch.set_rng_state(own["random"])
         if "random_cuda" in own:
             torch.cuda.set_rng_state(own["random_cuda"], self.device)
 
 
-def begins_anew(checkpoint: Checkpoint, team: Team, device: torch.device) -> bool:
-    """Whether a run that resumes ``checkpoint`` has new worlds: other processes wrote it, or another kind of device."""
-    return len(_processes(checkpoint)) != team.size or played_on(checkpoint) != device.type
+def restarts_worlds(checkpoint: Checkpoint, group: ProcessGroup, device: torch.device) -> bool:
+    """Whether a run that resumes ``checkpoint`` needs new worlds: number of processes or device type differs."""
+    return len(_processes(checkpoint)) != group.size or device_type_of(checkpoint) != device.type
 
 
-def played_on(checkpoint: Checkpoint) -> str:
-    """Kind of device, cpu or cuda, that the worlds of a checkpoint's run were on."""
+def device_type_of(checkpoint: Checkpoint) -> str:
+    """Device type, cpu or cuda, of the worlds of a checkpoint's run."""
     return "cuda" if any("random_cuda" in own for own in _processes(checkpoint)) else "cpu"
 
 
 def _processes(checkpoint: Checkpoint) -> list[dict[str, Any]]:
-    """What each process of a checkpoint's run kept of its own; nothing where only weights were."""
+    """The saved state of each process of a checkpoint's run; empty if it holds weights only."""
     return checkpoint.training["processes"] if checkpoint.training else []

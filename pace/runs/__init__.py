@@ -1,5 +1,5 @@
 """The folder of a run: checkpoints, metrics, progress, interruption, and queues of runs.
 
-Here belongs what is written to disk and read back, whatever is trained; not what is in the tensors. Imports ``config``,
-``arrays`` and ``command``.
+Reading and writing a run's files belongs here, whatever is trained; the meaning of the tensors does not. Imports
+``config``, ``arrays`` and ``command``.
 """

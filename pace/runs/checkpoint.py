@@ -1,7 +1,7 @@
 """Checkpoints: a folder of safetensors and JSON, so that loading one runs no code.
 
-``checkpoint.json`` holds the format number, the configuration, the counters and the shape of every tensor's place;
-``weights.safetensors`` the networks and normalisers; ``training.safetensors`` the rest that an exact resume needs
+``checkpoint.json`` holds the format number, the configuration, the counters and the place of every tensor;
+``weights.safetensors`` the networks and normalisers; ``training.safetensors`` the other state of an exact resume
 (optimisers, random states, the worlds). A folder is written under a temporary name and renamed when complete.
 """
 
@@ -33,7 +33,7 @@ class CheckpointError(RuntimeError):
 
 @dataclass
 class Checkpoint:
-    """One checkpoint in memory: ``weights`` by part (agent, predictor); no ``training`` when only weights are kept."""
+    """One checkpoint in memory: ``weights`` by part (agent, predictor); ``training``, None if it has weights only."""
 
     config: dict[str, Any]
     counters: dict[str, float]
@@ -100,7 +100,7 @@ def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> Path:
 
 
 def _sync(folder: Path) -> None:
-    """Have the files on the disk before the rename makes them the newest checkpoint."""
+    """Flush the files to the disk before the rename makes them the newest checkpoint."""
     for file in folder.iterdir():
         with file.open("rb") as handle:
             os.fsync(handle.fileno())
@@ -147,7 +147,7 @@ def load_checkpoint(path: str | Path, weights_only: bool = False) -> Checkpoint:
 
 
 def read_meta(folder: Path) -> dict[str, Any]:
-    """What ``checkpoint.json`` of a checkpoint holds: config, counters and places of the tensors, which stay unread.
+    """The content of ``checkpoint.json``: config, counters and places of the tensors, which are not read.
 
     The configuration is that of the current format, ``format`` that of the file.
 
@@ -203,7 +203,7 @@ def prune_checkpoints(run: Path, keep: int) -> None:
         shutil.rmtree(folder)
 
 
-#: Keys that say where and how a run was made, not what it learned: a kept policy has their defaults.
+#: Keys of where and how a run was made, not of what it learned: a published policy has their defaults.
 RUN_KEYS: dict[str, Any] = {
     "device": "auto", "processes": 0, "out": None, "resume": None, "init_from": None, "predictor_from": None
 }  # fmt: skip
@@ -212,7 +212,7 @@ RUN_KEYS: dict[str, Any] = {
 def export_weights(path: str | Path, folder: str | Path) -> Path:
     """Copy a checkpoint's weights and configuration without its training state, for ``pretrained/``.
 
-    Folders, threads and CUDA graphs of the machine that trained it are left out of the configuration.
+    Folders, threads and CUDA graphs of the training machine are left out of the configuration.
     """
     checkpoint = load_checkpoint(path, weights_only=True)
     slim = {part: {k: _single(v) for k, v in tensors.items()} for part, tensors in checkpoint.weights.items()}
@@ -223,5 +223,5 @@ def export_weights(path: str | Path, folder: str | Path) -> Path:
 
 
 def _single(tensor: Tensor) -> Tensor:
-    """Float32 of a float64 tensor; others as they are."""
+    """Float32 of a float64 tensor; others unchanged."""
     return tensor.float() if tensor.dtype == torch.float64 else tensor

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as a request that a loop can look at."""
+"""Ctrl-C and SIGTERM as a request that a loop can poll."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from contextlib import contextmanager
 
 
 class StopRequest:
-    """Set by the first Ctrl-C or SIGTERM; the update that runs is finished, saved, and the run ends."""
+    """Set by the first Ctrl-C or SIGTERM; the current update is finished and saved, and the run ends."""
 
     def __init__(self) -> None:
         self.name: str | None = None
 
     @contextmanager
     def listening(self) -> Iterator[None]:
-        """Take the two signals over while the block runs; a second one acts as it would without this class."""
+        """Handle the two signals while the block runs; a second one acts as it would without this class."""
         if threading.current_thread() is not threading.main_thread():
             yield
             return

@@ -1,4 +1,4 @@
-"""When a run first stands, hits and returns: moving averages of its metrics, and the milestones that they pass."""
+"""Moving averages of a run's metrics, and the milestones of standing, hitting and returning that they pass."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ Array = NDArray[np.float64]
 WINDOW = 250_000.0  # control steps that a point of a curve averages over: a thousand serves and more
 #: A rate of a curve -> its column in ``metrics.csv``: shares of the serves, and falls per second of a world's time.
 RATES = {"hits": "hit_rate", "returns": "success_rate", "falls": "fall_rate"}
-#: What a slim CSV keeps of ``metrics.csv``.
+#: Columns of ``metrics.csv`` in a slim CSV.
 SLIM_COLUMNS = (
     "update", "samples", "wall_s", "hit_rate", "success_rate", "fall_rate", "serves", "predictor_rmse_cm",
     "mean_reward", "kl", "lr", "policy_std",
 )  # fmt: skip
 SLIM_ROWS = 4  # rows of ``metrics.csv`` in one of a slim CSV
-_LAST = ("update", "samples", "wall_s")  # what counts from the start of a run: a slim row has its last value
+_LAST = ("update", "samples", "wall_s")  # totals since the start of a run: a slim row has the last value
 _SHARES = ("hit_rate", "success_rate")  # of the serves of a row
 
 
@@ -51,7 +51,7 @@ MILESTONES = (
 class Curve:
     """Moving averages of a run, arrays (M,): ``samples`` in control steps, ``minutes`` of the clock, ``rates`` by name.
 
-    Points whose window is not full are left out; a rate is NaN where nothing was counted in the window.
+    Points whose window is not full are left out; a rate is NaN if nothing was counted in the window.
     """
 
     samples: Array
@@ -61,7 +61,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class Passage:
-    """Where a curve first passes a milestone; ``at_start``: its first point is already beyond."""
+    """The point at which a curve first passes a milestone; ``at_start``: its first point is already beyond."""
 
     samples: float
     minutes: float
@@ -79,7 +79,7 @@ def read_metrics(file: str | Path, columns: Iterable[str] | None = None) -> dict
 def read_curve(file: str | Path, window: float = WINDOW, columns: Mapping[str, str] = RATES) -> Curve:
     """The curve of a ``metrics.csv``, whole or slim, averaged over the last ``window`` control steps.
 
-    Shares are weighted by the serves of their rows where the file has them. ``columns``: names of the rates in it.
+    Shares are weighted by the serves of their rows if the file has them. ``columns``: names of the rates in it.
     """
     wanted = ("samples", "wall_s", "serves", *columns.values())
     metrics = {name: np.array(values) for name, values in read_metrics(file, wanted).items()}
@@ -95,7 +95,7 @@ def read_curve(file: str | Path, window: float = WINDOW, columns: Mapping[str, s
 
 
 def _full_windows(samples: Array, window: float) -> NDArray[np.bool_]:
-    """Where so many control steps have gone by; the first row is taken to be as long as the second."""
+    """Start of each row in control steps; the first row is taken to be as long as the second."""
     if len(samples) < 2:
         return np.zeros(len(samples), dtype=bool)
     began = 2.0 * samples[0] - samples[1]
@@ -117,9 +117,9 @@ def _moving_mean(samples: Array, values: Array, weight: Array, window: float) ->
 
 
 def passage(curve: Curve, milestone: Milestone) -> Passage | None:
-    """Where ``curve`` first passes ``milestone``; None if it never does.
+    """The point at which ``curve`` first passes ``milestone``; None if it never does.
 
-    For falls, what comes before the most of them does not count: robots that were just reset have not fallen yet.
+    For falls, points before the maximum do not count: robots that were just reset have not fallen yet.
     """
     rate = curve.rates[milestone.rate]
     if not np.isfinite(rate).any():

@@ -1,4 +1,4 @@
-"""The state of an optimiser in the form that checkpoints hold."""
+"""The state of an optimiser in the form of a checkpoint."""
 
 from __future__ import annotations
 

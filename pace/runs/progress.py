@@ -1,4 +1,4 @@
-"""What a training run shows while it runs: a bar on a terminal, plain lines elsewhere."""
+"""The progress display of a training run: a bar on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def clock(seconds: float) -> str:
 
 
 def rate_texts(rates: dict[str, float]) -> list[str]:
-    """Rates (keys of :data:`RATES`) in words; a dash where nothing was counted yet."""
+    """Rates (keys of :data:`RATES`) in words; a dash if nothing was counted yet."""
     texts = []
     for name, rate in rates.items():
         label, factor, digits, unit = RATES[name]
@@ -60,7 +60,7 @@ class Progress:
             self._bar = tqdm(total=1.0, bar_format="{percentage:3.0f}%|{bar:16}| {desc}", dynamic_ncols=True)
 
     def show(self, row: dict[str, float]) -> None:
-        """Take in the row of one update and show the state of the run."""
+        """Add the row of one update and show the state of the run."""
         self.recent.append(row)
         if not self._enabled:
             return
@@ -98,11 +98,11 @@ class Progress:
         return {name: self.mean(name) for name in self.shown}
 
     def mean(self, name: str) -> float:
-        """Mean of a column over the last updates, NaN left out; NaN if nothing is there."""
+        """Mean of a column over the last updates, without NaN; NaN if no value is left."""
         values = [row[name] for row in self.recent if not math.isnan(row[name])]
         return sum(values) / len(values) if values else math.nan
 
     def close(self) -> None:
-        """Leave the terminal in order."""
+        """Close the bar."""
         if self._bar is not None:
             self._bar.close()

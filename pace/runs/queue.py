@@ -1,6 +1,6 @@
-"""Training runs one after another or several at once: each a process of its own, on its share of the cores.
+"""Training runs one after another or several at once: each a separate process, on its share of the cores.
 
-What a run has reached is read from its folder, so a queue that was interrupted goes on where it stopped.
+The progress of a run is read from its folder, so an interrupted queue resumes where it stopped.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from pace.runs.run_folder import LEADING, METRICS
 TRAIN = (sys.executable, "-m", "pace.rl.train")
 POLL_SECONDS = 0.5
 TAIL_BYTES = 8192  # of a metrics.csv: more than its last row
-#: What may differ between the runs that are there and those that are asked for.
+#: Keys that may differ between an existing run and the requested one.
 FREE_KEYS = (*RESUME_KEYS, "init_from", "predictor_from", "out")
 
 
 @dataclass(frozen=True)
 class Run:
-    """A training run: where it is kept, the overrides of a new one, how many control steps it takes, and the modules
-    from outside of pace that the user has named for it."""
+    """A training run: its folder, the overrides of a new one, its number of control steps, and the modules from outside
+    of pace that the user has named for it."""
 
     folder: Path
     overrides: tuple[str, ...]
@@ -50,7 +50,7 @@ class Run:
 
     @property
     def log(self) -> Path:
-        """What its processes print."""
+        """File for the output of its processes."""
         return self.folder.with_name(f"{self.name}.log")
 
     def saved_samples(self) -> int:
@@ -64,7 +64,7 @@ class Run:
         return self.saved_samples() >= self.samples
 
     def arguments(self) -> list[str]:
-        """Of ``python -m pace.rl.train``, to begin the run or to go on with it."""
+        """Of ``python -m pace.rl.train``, to begin the run or to resume it."""
         limits = [f"samples={self.samples}", "minutes=0", "progress=false"]
         if list_checkpoints(self.folder):
             modules = [f"plugins=[{','.join(self.plugins)}]"] if self.plugins else []
@@ -73,11 +73,11 @@ class Run:
 
 
 def check_settings(run: Run) -> Run:
-    """Compare the run that is in the folder, if any, with the one that is asked for.
+    """Compare the run in the folder, if any, with the requested one.
 
     Returns the run, with the modules from outside that its overrides name.
 
-    Errors: :class:`ConfigError` that names a key in which they differ, or one that is wrong in what is asked for.
+    Errors: :class:`ConfigError` that names a key in which they differ, or a wrong key of the request.
     """
     config = load_train_config(list(run.overrides))
     run, asked = replace(run, plugins=tuple(config.plugins)), _flat(to_dict(config))
@@ -94,7 +94,7 @@ def check_settings(run: Run) -> Run:
 
 
 def _is_free(key: str, asked: Mapping[str, object]) -> bool:
-    """Whether a run may differ in ``key`` from what is asked for. A run saves the priors that it has derived."""
+    """Whether a run may differ in ``key`` from the request. A run saves the priors that it has derived."""
     derived = "predictor.priors" in asked and key.startswith("predictor.priors")
     return derived or key.split(".")[0] in FREE_KEYS
 
@@ -108,7 +108,7 @@ def _flat(tree: dict, prefix: str = "") -> dict:
 
 
 def logged_samples(folder: Path) -> int:
-    """Control steps in the last row of a run's metrics; 0 where there is none."""
+    """Control steps in the last row of a run's metrics; 0 without a row."""
     file = folder / METRICS
     if not file.exists():
         return 0
@@ -121,7 +121,7 @@ def logged_samples(folder: Path) -> int:
 
 
 def shares_of_cores(jobs: int) -> list[list[int]]:
-    """Cores for each of ``jobs`` processes, at least one; empty lists where the system does not bind to cores."""
+    """Cores for each of ``jobs`` processes, at least one; empty lists if the system does not bind to cores."""
     if not hasattr(os, "sched_getaffinity"):
         return [[] for _ in range(jobs)]
     cores = sorted(os.sched_getaffinity(0))
@@ -130,7 +130,7 @@ def shares_of_cores(jobs: int) -> list[list[int]]:
 
 @dataclass
 class Job:
-    """A run whose process is at work."""
+    """A run with a running process."""
 
     run: Run
     process: subprocess.Popen[bytes]
@@ -139,7 +139,7 @@ class Job:
 
     @classmethod
     def start(cls, run: Run, cores: Sequence[int]) -> Job:
-        """Begin or resume ``run`` on ``cores``. A group of its own keeps the terminal's Ctrl-C from it."""
+        """Begin or resume ``run`` on ``cores``, in its own process group, so that Ctrl-C does not reach it."""
         run.folder.parent.mkdir(parents=True, exist_ok=True)
         log = run.log.open("ab")
         process = subprocess.Popen(
@@ -150,7 +150,7 @@ class Job:
             env=({"OMP_NUM_THREADS": str(len(cores))} if cores else {}) | os.environ,
             process_group=0,
         )
-        if cores:  # it has not got as far as starting threads or helpers, which will inherit this
+        if cores:  # early enough: its threads and workers start later and inherit this
             os.sched_setaffinity(process.pid, cores)
         return cls(run, process, log)
 
@@ -170,9 +170,9 @@ class Job:
 
 
 class RunQueue:
-    """Plays ``runs``, ``jobs`` at a time, with a bar of all their control steps and the time that is left.
+    """Trains ``runs``, ``jobs`` at a time, with a bar of all their control steps and the time that is left.
 
-    Attributes: ``failures``, the reason by the name of each run that failed; the others are played all the same.
+    Attributes: ``failures``, the reason by the name of each run that failed; the others still run.
     """
 
     def __init__(self, runs: Sequence[Run], jobs: int, progress: bool = True) -> None:
@@ -194,7 +194,7 @@ class RunQueue:
         )
 
     def play(self) -> None:
-        """Train what is not finished. Errors: ``KeyboardInterrupt`` when stopped by Ctrl-C or SIGTERM.
+        """Train the unfinished runs. Errors: ``KeyboardInterrupt`` when stopped by Ctrl-C or SIGTERM.
 
         The runs are then saved first; a second Ctrl-C does not wait for that.
         """
@@ -227,7 +227,7 @@ class RunQueue:
                 self._active[slot] = Job.start(self._waiting.popleft(), cores)
 
     def _collect(self) -> None:
-        """Take note of the runs whose processes have ended."""
+        """Record the runs whose processes have ended."""
         for slot, job in list(self._active.items()):
             if job.process.poll() is None:
                 continue

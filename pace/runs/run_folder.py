@@ -33,7 +33,7 @@ CURVE_WINDOW = 40  # rows of the moving average in the plot
 
 
 def default_folder(name: str) -> Path:
-    """``runs/<date>_<name>``, with a number where that is taken."""
+    """``runs/<date>_<name>``, with a number if that exists already."""
     base = Path("runs") / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}_{name}"
     candidate, number = base, 2
     while candidate.exists():
@@ -42,7 +42,7 @@ def default_folder(name: str) -> Path:
 
 
 def versions() -> dict[str, Any]:
-    """Versions of what the run depends on, the machine, the command line and the state of the git checkout."""
+    """Versions of the dependencies, the machine, the command line and the state of the git checkout."""
     packages: dict[str, str | None] = {}
     for package in (*PACKAGES, "pace-table-tennis"):
         try:
@@ -75,11 +75,11 @@ def git_state(folder: Path) -> dict[str, Any] | None:
 
 
 class RunFolder:
-    """Files of one run, of which one process at a time is the owner. Rows that a crashed run logged after
-    ``first_update``, its last checkpoint, are dropped.
+    """Files of one run, owned by one process at a time. Rows that a crashed run logged after ``first_update``, its last
+    checkpoint, are dropped.
 
-    Errors: :class:`ConfigError` for a folder that cannot be made, that another process owns, or that holds a checkpoint
-    later than that.
+    Errors: :class:`ConfigError` for a folder that cannot be made, that another process owns, or that holds a later
+    checkpoint.
     """
 
     def __init__(self, path: str | Path, config: dict[str, Any], tensorboard: bool, first_update: int = 0) -> None:
@@ -92,12 +92,12 @@ class RunFolder:
         self._board = TensorboardLogger("events", str(self.path)) if tensorboard else None
 
     def _claim(self, first_update: int) -> None:
-        """Make the folder, which must not hold a checkpoint that the run's own ones would lie behind."""
+        """Make the folder, which must not hold a checkpoint that is newer than the run's."""
         try:
             self.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise ConfigError(f"out={self.path} cannot be made: {error.strerror}") from error
-        self._lock = FileLock(self.path / LOCK)  # the system lets go of it with the process, however that ends
+        self._lock = FileLock(self.path / LOCK)  # the system releases it when the process ends, for whatever reason
         try:
             self._lock.acquire(timeout=0)
         except Timeout as error:
@@ -107,7 +107,7 @@ class RunFolder:
         last = max((int(folder.name.removeprefix("update_")) for folder in list_checkpoints(self.path)), default=0)
         if last > first_update:
             raise ConfigError(
-                f"{self.path} has a checkpoint of update {last}: resume={self.path} goes on from it; "
+                f"{self.path} has a checkpoint of update {last}: resume={self.path} continues it; "
                 "or give another out=, or move it away"
             )
 
@@ -144,7 +144,7 @@ class RunFolder:
                     self._board.log_scalar(name, value, step=int(row["samples"]))
 
     def close(self) -> None:
-        """Flush and close the logs, and let go of the folder."""
+        """Flush and close the logs, and release the folder."""
         self._file.close()
         self._lock.release()
         if self._board is not None:
@@ -186,7 +186,9 @@ def plot_learning_curve(run: str | Path) -> Path | None:
             smooth = moving_average(metrics[column], CURVE_WINDOW)
             axes.plot(millions, [factor * value for value in smooth], label=name)
         axes.set_ylabel(label)
-        axes.update_datalim([(millions[0], 0.0)])  # zero is in view, and the margin above is one of the whole height
+        axes.update_datalim(
+            [(millions[0], 0.0)]
+        )  # zero is in view, and the upper margin is a share of the whole height
         axes.autoscale_view()
         axes.set_ylim(bottom=0)
         axes.grid(alpha=0.3)

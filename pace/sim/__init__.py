@@ -1,7 +1,6 @@
-"""Physics of N table-tennis worlds: the robot, the ball and what the robot senses. Knows nothing of learning.
+"""Physics of N table-tennis worlds: the robot, the ball and the robot's sensors. Knows nothing of learning.
 
-Here belongs what is true of the world, and how sensors see it; not what is asked of the robot. Imports ``arrays`` and
-the rooms below.
+The state of the world and its sensors belong here; the robot's task does not. Imports ``arrays`` and the rooms below.
 """
 
 from __future__ import annotations

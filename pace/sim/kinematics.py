@@ -33,7 +33,7 @@ class Tips:
     #: (N, S + 1, 12): centre (m), unit normal (the link's x axis), linear velocity of the centre (m/s), angular
     #: velocity (rad/s) at the S + 1 instants of the control step
     paddle_path: Annotated[Float, "instants", "columns"]
-    foot_position: Feet  # m, centre of the sole, at the end of the control step as all that follows
+    foot_position: Feet  # m, centre of the sole; this and the following at the end of the control step
     foot_velocity: Feet  # m/s
     foot_up: Feet  # unit vector, the foot's z axis
     head_position: Vec3  # m
@@ -41,7 +41,7 @@ class Tips:
 
 @struct_of(Tips)
 class TipArrays:
-    """:class:`Tips` as kernels see it."""
+    """:class:`Tips` in the kernels' form."""
 
 
 @wp.struct
@@ -84,7 +84,7 @@ def _base(qpos: wp.array[float], qvel: wp.array[float]) -> Frame:
 
 @wp.func
 def _moved(frame: Frame, offset: wp.vec3) -> Frame:
-    """The same link at another of its points, ``offset`` in its own frame."""
+    """The same link at another point, ``offset`` in the link's frame."""
     lever = wp.quat_rotate(frame.rotation, offset)
     frame.position += lever
     frame.velocity += wp.cross(frame.angular_velocity, lever)
@@ -202,7 +202,7 @@ def _chain(model: mujoco.MjModel, site: str) -> tuple[list[tuple[int, NDArray, N
 
 def _build_chains(model: mujoco.MjModel, tips: Sequence[str], device: wp.Device) -> Chains:
     if np.any(model.jnt_pos[1:]):
-        raise ValueError("kinematics wants every joint at the origin of its body (joint pos 0 0 0)")
+        raise ValueError("kinematics needs every joint at the origin of its body (joint pos 0 0 0)")
     parts = [_chain(model, tip) for tip in tips]
     links = [link for joints, _ in parts for link in joints]
     chains = Chains()
@@ -252,8 +252,8 @@ class Kinematics(Tips):
     def paddle_generalized_force(self, force: Tensor, point: Tensor, out: Tensor) -> None:
         """Write J^T f of a force on the paddle's link into ``out`` (N, 6 + J), for the end of the path last given.
 
-        Args: force (N, 3) N and its point of attack (N, 3) m, world frame. Give the same tensors each time: others are
-        bound anew, which takes longer.
+        Args: force (N, 3) N and its point of action (N, 3) m, world frame. Give the same tensors each time: others are
+        bound again, which takes longer.
         Errors: RuntimeError before the first :meth:`update`.
         """
         if self._path is None:

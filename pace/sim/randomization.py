@@ -1,6 +1,6 @@
-"""Per-world draws of robot, motor, ball, air and contact parameters, and of pushes.
+"""Per-world random parameters of robot, motor, ball, air and contact, and random pushes.
 
-Draws are made where a mask says so, on the device (:mod:`pace.arrays.draws`), so that a reset never waits for the host.
+The worlds of a mask are resampled on the device (:mod:`pace.arrays.draws`), so that a reset never waits for the host.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from pace.arrays.draws import Column, Draws
+from pace.arrays.draws import Column, UniformSampler
 from pace.arrays.launch import Launch
 from pace.arrays.state import Stateful, tensors_named, with_prefix
 from pace.config.base import ConfigError
@@ -17,10 +17,18 @@ from pace.config.sim import BallConfig, RandomizationConfig
 from pace.sim.ball.ball import BallParams
 from pace.sim.engine.base import EngineParams
 
-#: Engine parameters that are drawn straight from the range of the same name.
-ENGINE_DRAWS = ("friction", "trunk_mass", "trunk_com", "kp_scale", "kd_scale", "armature_scale", "effort_scale")
-#: Ball parameter -> (range, whether the draw scales the nominal value or is added to it).
-BALL_DRAWS = {
+#: Engine parameters that are sampled directly from the range of the same name.
+SAMPLED_ENGINE_PARAMS = (
+    "friction",
+    "trunk_mass",
+    "trunk_com",
+    "kp_scale",
+    "kd_scale",
+    "armature_scale",
+    "effort_scale",
+)
+#: Ball parameter -> (range, whether the sample scales the nominal value or is added to it).
+SAMPLED_BALL_PARAMS = {
     "mass": ("ball_mass_scale", True),
     "drag_coefficient": ("drag_scale", True),
     "magnus_coefficient": ("magnus", False),
@@ -42,7 +50,7 @@ def _push(
     until_push: wp.array[wp.float32],
     push: wp.array2d[wp.float32],
 ):
-    """One world's time to its next push, s, and the push (x, y) that is due, m/s; zero where none is."""
+    """One world's time to its next push, s, and the current push (x, y), m/s; zero if none is due."""
     world = wp.tid()
     left = until_push[world] - control_dt
     x, y = 0.0, 0.0
@@ -57,7 +65,7 @@ def _push(
 
 
 class Randomizer(Stateful):
-    """Draws the parameters of N worlds at reset, and the pushes in between.
+    """Samples the parameters of N worlds at reset, and the pushes in between.
 
     Attributes: ``actuator_delay`` (N,) s; ``push`` (N, nv) velocity to add to the generalized velocity before the
     next control step (m/s on the base's x and y, zero elsewhere).
@@ -76,7 +84,7 @@ class Randomizer(Stateful):
         self.config = config
         self._engine_params = engine_params
         self._ball_params = ball_params
-        self._nominal_ball = {name: float(getattr(ball, name)) for name in BALL_DRAWS}
+        self._nominal_ball = {name: float(getattr(ball, name)) for name in SAMPLED_BALL_PARAMS}
         self._generator = generator
         if not 0.0 <= config.actuator_delay[0] <= config.actuator_delay[1] <= control_dt:
             raise ConfigError(f"randomization.actuator_delay must lie within one control step (0 to {control_dt} s)")
@@ -85,40 +93,40 @@ class Randomizer(Stateful):
         self.push = torch.zeros(num_worlds, num_velocities, device=device)
         self.pushes_enabled = config.push_interval[1] > 0.0
         self._until_push = torch.zeros(num_worlds, device=device)
-        self._draw = Draws(self._columns(), generator)
+        self._sample = UniformSampler(self._columns(), generator)
         self._seed = torch.zeros(1, dtype=torch.int32, device=device)
-        drawn = {"interval": config.push_interval, "velocity": config.push_velocity, "seed": self._seed}
+        sampled = {"interval": config.push_interval, "velocity": config.push_velocity, "seed": self._seed}
         kept = {"until_push": self._until_push, "push": self.push}
-        self._advance_push = Launch(_push, num_worlds, device, control_dt=control_dt, **drawn, **kept)
-        self.draw(torch.ones(num_worlds, dtype=torch.bool, device=device))
+        self._advance_push = Launch(_push, num_worlds, device, control_dt=control_dt, **sampled, **kept)
+        self.sample(torch.ones(num_worlds, dtype=torch.bool, device=device))
 
     def _columns(self) -> list[Column]:
-        """What :meth:`draw` draws: where it is kept, its range and its limits."""
-        robot = {name: getattr(self._engine_params, name) for name in ENGINE_DRAWS}
+        """The numbers that :meth:`sample` samples: storage, range and limits."""
+        robot = {name: getattr(self._engine_params, name) for name in SAMPLED_ENGINE_PARAMS}
         robot |= {"actuator_delay": self.actuator_delay, "push_interval": self._until_push}
         columns = []
         for name, target in robot.items():
             low, high = getattr(self.config, name)
             columns += [Column(values, low, high) for values in target.view(target.shape[0], -1).unbind(1)]
-        for name, (range_name, scales) in BALL_DRAWS.items():
+        for name, (range_name, scales) in SAMPLED_BALL_PARAMS.items():
             nominal, ends = self._nominal_ball[name], getattr(self.config, range_name)
             low, high = (end * nominal if scales else end + nominal for end in ends)
             limits = BALL_LIMITS.get(name, (0.0, float("inf")))
             columns.append(Column(getattr(self._ball_params, name), low, high, *limits))
         return columns
 
-    def draw(self, mask: Tensor) -> None:
-        """Draw new parameters for the worlds of ``mask`` (N,) bool."""
-        self._draw(mask)
+    def sample(self, mask: Tensor) -> None:
+        """Resample the parameters of the worlds of ``mask`` (N,) bool."""
+        self._sample(mask)
 
     def update_push(self) -> Tensor:
-        """Advance the push timers by one control step; return ``push`` (N, nv), zero where no push is due."""
+        """Step the push timers by one control step; return ``push`` (N, nv), zero if no push is due."""
         self._seed.random_(generator=self._generator)
         self._advance_push()
         return self.push
 
     def state_tensors(self) -> dict[str, Tensor]:
-        """Everything that was drawn, for an exact resume."""
-        engine = with_prefix("engine", tensors_named(self._engine_params, ENGINE_DRAWS))
-        ball = with_prefix("ball", tensors_named(self._ball_params, tuple(BALL_DRAWS)))
+        """All samples, for an exact resume."""
+        engine = with_prefix("engine", tensors_named(self._engine_params, SAMPLED_ENGINE_PARAMS))
+        ball = with_prefix("ball", tensors_named(self._ball_params, tuple(SAMPLED_BALL_PARAMS)))
         return engine | ball | {"actuator_delay": self.actuator_delay, "until_push": self._until_push}

@@ -1,4 +1,4 @@
-"""Pictures of the scene without a window, with marks and lines drawn into it. Needs OpenGL (EGL on a headless machine).
+"""Images of the scene without a window, with marks and lines drawn into it. Needs OpenGL (EGL on a headless machine).
 
 Colours are r, g, b, a in 0 to 1; pictures are uint8 (height, width, 3).
 """
@@ -20,13 +20,13 @@ Picture = NDArray[np.uint8]
 
 NO_GL = (
     "there is no OpenGL to draw with. Debian, Ubuntu: apt install libegl1 libgles2 libgl1-mesa-dri "
-    "(with an NVIDIA driver its own EGL is taken). MUJOCO_GL=egl|glfw|osmesa chooses another way"
+    "(an NVIDIA driver brings its EGL). MUJOCO_GL=egl|glfw|osmesa chooses another backend"
 )
 SHADOW_SIZE = 1024  # pixels; software rendering spends most of its time on shadows
 
 
 class RenderError(RuntimeError):
-    """Nothing to draw with; the message says what to install."""
+    """OpenGL is missing; the message says what to install."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def top_camera(x: float, y: float, height: float) -> mujoco.MjvCamera:
 
 
 def _gl_context() -> Any:
-    """MuJoCo's class of OpenGL contexts; EGL where there is no screen and nothing else is asked for."""
+    """MuJoCo's class of OpenGL contexts; EGL if there is no screen and MUJOCO_GL is not set."""
     headless = sys.platform == "linux" and not os.environ.get("DISPLAY") and not os.environ.get("WAYLAND_DISPLAY")
     if headless and not os.environ.get("MUJOCO_GL"):
         from mujoco.egl import GLContext
@@ -74,7 +74,7 @@ class SceneRenderer:
     """Draws states of one model. Close it after use, or use it as a context manager.
 
     Args: model: with its visual geoms; width, height: pixels.
-    Errors: :class:`RenderError` where there is no OpenGL.
+    Errors: :class:`RenderError` without OpenGL.
     """
 
     def __init__(self, model: mujoco.MjModel, width: int, height: int) -> None:
@@ -105,7 +105,7 @@ class SceneRenderer:
         self._gl.free()
 
     def set_state(self, qpos: NDArray[np.floating], ball: NDArray[np.floating]) -> None:
-        """Robot qpos (28,) and ball position (3,) m of the pictures that follow."""
+        """Set robot qpos (28,) and ball position (3,) m of the next pictures."""
         self.data.qpos[:] = qpos
         self.data.mocap_pos[0] = ball
         mujoco.mj_kinematics(self.model, self.data)
@@ -116,7 +116,7 @@ class SceneRenderer:
         """A new picture from a camera of the model, or a free one, with ``marks`` in it."""
         view = camera if isinstance(camera, mujoco.MjvCamera) else self._fixed(camera)
         everything = mujoco.mjtCatBit.mjCAT_ALL
-        mujoco.mjv_updateCamera(self.model, self.data, view, self._scene)  # first: the headlight is where it was last
+        mujoco.mjv_updateCamera(self.model, self.data, view, self._scene)  # first: the headlight uses its last position
         mujoco.mjv_updateScene(self.model, self.data, self._option, None, view, everything, self._scene)
         for mark in marks:
             self._add(mark)

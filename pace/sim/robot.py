@@ -14,9 +14,9 @@ from pace.sim.robot_spec import RobotSpec, model_path, read_scene
 
 #: Name of the keyframe: nominal pose, soles on the floor.
 NOMINAL_KEY = "nominal"
-#: Group of the geoms that only the eye needs.
+#: Group of the geoms that are only for display.
 VISUAL_GROUP = 2
-#: The one input of a motor: its target position.
+#: The only input of a motor: its target position.
 POSITION = int(mujoco.mjtCtrlInput.mjINPUT_POS)
 
 
@@ -42,9 +42,9 @@ def joint_gains(robot: RobotConfig) -> NDArray[np.float64]:
 
 
 def motor_lines(robot: RobotConfig) -> NDArray[np.float64] | None:
-    """Rows no-load speed (rad/s) and stall torque (N m) of every joint: (2, J); None: motors that know no speed.
+    """Rows no-load speed (rad/s) and stall torque (N m) of every joint: (2, J); None: motors without a speed limit.
 
-    The most that a motor drives with falls on a line from its stall torque at rest to zero at its no-load speed.
+    A motor's largest torque falls on a line from its stall torque at rest to zero at its no-load speed.
     Errors: those of :func:`joint_gains`.
     """
     if not robot.stall_ratio:
@@ -67,7 +67,7 @@ def build_model(robot: RobotConfig, engine: EngineConfig, table: TableConfig, vi
         robot: gains, efforts, armature and nominal pose.
         engine: time step, solver iterations and cone.
         table: size of table, net and paddle.
-        visual: keep the geoms that only the eye needs. The dynamics are the same with and without them;
+        visual: keep the geoms that are only for display. The dynamics are the same with and without them;
             physics leaves them out because each costs time in every step.
 
     Errors: :class:`ConfigError` for gains or a pose that do not fit the robot's joints.
@@ -102,8 +102,8 @@ def _set_motors(spec: mujoco.MjSpec, robot: RobotConfig) -> None:
 def _set_line(actuator: mujoco.MjsActuator, kp: float, kd: float, speed: float, stall: float) -> None:
     """Make the motor's drive saturate on its torque-speed line; below it the torque is kp (u - q) - kd w, as before.
 
-    MuJoCo's motor of constant K and resistance R gives K (V - K w) / R, and its drive asks for the voltage
-    V = R / K (kp (u - q) - kd w) + K w, at most Vmax. Volts are no measured quantity here, so K is 1: then Vmax is the
+    MuJoCo's motor of constant K and resistance R gives K (V - K w) / R, and its drive applies the voltage
+    V = R / K (kp (u - q) - kd w) + K w, at most Vmax. The voltage is not measured here, so K is 1: then Vmax is the
     no-load speed and 1 / R the slope of the line. No winding inductance: the motor has no state.
     """
     actuator.set_to_dcmotor(

@@ -1,4 +1,4 @@
-"""What a robot is made of: the names of its parts, read from its MJCF and the configuration.
+"""Names of a robot's parts, read from its MJCF and the configuration.
 
 Another robot is another MJCF and another ``configs/robot/<name>.yaml``; nothing else in the package names a joint.
 """
@@ -45,14 +45,14 @@ class RobotSpec:
 
     @property
     def tips(self) -> tuple[str, ...]:
-        """Sites whose motion is followed: paddle, left and right foot, head."""
+        """Sites whose motion is computed: paddle, left and right foot, head."""
         return (self.paddle, *self.feet, self.head)
 
     @classmethod
     def of(cls, robot: RobotConfig) -> RobotSpec:
         """The robot that the configuration names.
 
-        Errors: :class:`ConfigError` for an MJCF that cannot be read, or that lacks a part, or a free base.
+        Errors: :class:`ConfigError` for an MJCF that cannot be read, or that lacks a part or a free base.
         """
         found = _parts(model_path(robot))
         _check(robot, found)
@@ -69,7 +69,7 @@ class RobotSpec:
 
 @dataclass(frozen=True)
 class Parts:
-    """Names that an MJCF gives: actuated joints, sites, and geoms whose contacts are counted."""
+    """Names in an MJCF: actuated joints, sites, and geoms whose contacts are counted."""
 
     joints: tuple[str, ...]
     sites: tuple[str, ...]
@@ -79,7 +79,7 @@ class Parts:
 def model_path(robot: RobotConfig) -> Path:
     """The robot's MJCF: ``robot.model``, a file of this package's assets or any other path.
 
-    Errors: :class:`ConfigError` for a file that is not there.
+    Errors: :class:`ConfigError` for a missing file.
     """
     for path in (ASSETS / robot.model, Path(robot.model)):
         if path.is_file():

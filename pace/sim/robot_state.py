@@ -1,4 +1,4 @@
-"""The state of N robots as sensors, task and rewards read it, and the kernels' struct of it."""
+"""The state of N robots for sensors, task and rewards, and the kernels' struct of it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Feet = Annotated[Vec3, "feet"]  # (N, 2, 3), left and right
 
 @dataclass(frozen=True)
 class RobotState:
-    """The robot at the end of the last control step: tensors (N, ...), float32, world frame unless said.
+    """The robot at the end of the last control step: tensors (N, ...), float32, world frame unless stated.
 
     The tensors are allocated once and overwritten by each step. Contact forces, body contacts and joint torques belong
     to the last physics step.
@@ -36,10 +36,10 @@ class RobotState:
     foot_velocity: Feet  # m/s
     foot_up: Feet  # unit vector, the foot's z axis
     foot_force: Feet  # N
-    body_contact: Annotated[Float, "bodies"]  # 1 where a body other than the feet touches something
+    body_contact: Annotated[Float, "bodies"]  # 1 if a body other than the feet touches something
     head_position: Vec3  # m
 
 
 @struct_of(RobotState)
 class RobotArrays:
-    """:class:`RobotState` as kernels see it."""
+    """:class:`RobotState` in the kernels' form."""

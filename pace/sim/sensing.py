@@ -1,6 +1,6 @@
-"""What the robot's sensors report: delayed motion capture, noisy proprioception.
+"""The robot's sensors: delayed motion capture, noisy proprioception.
 
-Everything that an actor may see of the world passes through :class:`Sensing`; it never hands out a true value.
+All of the actor's information about the world passes through :class:`Sensing`, which never returns a true value.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def _see(
     new_ball: bool,
     new_world: bool,
 ):
-    """Put the newest motion-capture frame into a world's line, newest first; what is new has no past."""
+    """Put a motion-capture frame into a world's delay line, newest first; a new ball or robot fills all of it."""
     if not new_world:
         for age in range(line.shape[0] - 1, 0, -1):
             for column in range(line.shape[1]):
@@ -72,7 +72,7 @@ def _sense(
     sensed: wp.array2d[wp.float32],
 ):
     """Sense one world. With ``reset`` the masked worlds only, as if they had stood still, with a new delay (control
-    steps, from the range ``delays``) and a new scale of the noise; else their ball is new."""
+    steps, from the range ``delays``) and a new scale of the noise; else the ball of the masked worlds is new."""
     world = wp.tid()
     if reset == 1 and not mask[world]:
         return
@@ -99,15 +99,15 @@ def _sense(
 class Sensing(Stateful):
     """Sensed signals of N worlds, overwritten in place once a control step.
 
-    Everything has uniform noise, whose amplitudes have a common scale that is drawn per world at reset. Motion capture
-    (base position, heading, ball) is also late by a delay that is drawn per world at reset, linearly interpolated
+    All signals have uniform noise, whose amplitudes have a common scale that is sampled per world at reset. Motion
+    capture (base position, heading, ball) also has a delay that is sampled per world at reset, linearly interpolated
     between the control steps around it. A new ball is a new track of the motion-capture system: its first sample is its
     first position.
 
     Attributes: ``base_angular_velocity`` (N, 3) rad/s body frame, ``projected_gravity`` (N, 3), ``joint_position``
     (N, J) rad from the nominal pose, ``joint_velocity`` (N, J) rad/s, ``base_position`` (N, 3) m,
-    ``ball_position`` (N, 3) m, ``heading`` (N, 2), ``base_shift_noise`` (N, 2) m for what is computed from sensed
-    values; world frame unless said.
+    ``ball_position`` (N, 3) m, ``heading`` (N, 2), ``base_shift_noise`` (N, 2) m for quantities computed from sensed
+    values; world frame unless stated.
     """
 
     STATE = ("_nominal", "_amplitude", "_sensed", "_line", "_delay", "_scale")
@@ -151,16 +151,16 @@ class Sensing(Stateful):
 
     @property
     def delay(self) -> Tensor:
-        """(N,) control steps by which motion capture is late in each world."""
+        """(N,) control steps, delay of motion capture in each world."""
         return self._delay
 
     def update(self, robot: RobotState, ball_position: Tensor, new_ball: Tensor) -> None:
-        """One control step later: sense the state; ``new_ball`` (N,) bool marks balls that were just launched."""
+        """Sense the state after a control step; ``new_ball`` (N,) bool marks balls that were just launched."""
         self._seed.random_(generator=self._generator)
         self._bound(robot, ball_position)[0](new_ball)
 
     def reset(self, mask: Tensor, robot: RobotState, ball_position: Tensor) -> None:
-        """Draw new delays for the worlds of ``mask`` (N,) bool and sense them as if they had stood still so far."""
+        """Sample new delays for the worlds of ``mask`` (N,) bool and sense them as if they had stood still so far."""
         self._seed.random_(generator=self._generator)
         self._bound(robot, ball_position)[1](mask)
 

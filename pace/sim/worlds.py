@@ -1,4 +1,4 @@
-"""N worlds of robot and ball: one control step of physics, resets by mask, and the state that a task reads."""
+"""N worlds of robot and ball: one control step of physics, resets by mask, and the state for a task."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def _derive(
 
 @wp.kernel
 def _spread_delay(delay: wp.array[float], physics_dt: float, new_share: wp.array2d[float]):
-    """Share of each physics step that is left once the new target has passed the actuator delay."""
+    """Share of each physics step that is left after the new target has passed the actuator delay."""
     world = wp.tid()
     for step in range(new_share.shape[1]):
         new_share[world, step] = wp.clamp((float(step + 1) * physics_dt - delay[world]) / physics_dt, 0.0, 1.0)
@@ -68,7 +68,7 @@ def _stand(
     previous_targets: wp.array2d[float],
     impulse: wp.array[wp.vec3],
 ):
-    """A robot that was just reset holds its joints where they are, and feels nothing of the last ball."""
+    """A robot that was just reset holds its joint positions and gets no impulse of the last ball."""
     world = wp.tid()
     if not mask[world]:
         return
@@ -93,8 +93,8 @@ class Worlds(Stateful):
     Args:
         config: robot, ball, engine and randomisation.
         num_worlds: N.
-        device: ``auto``, ``cpu``, ``cuda`` or ``cuda:1``; ``auto`` takes the first GPU where there is one.
-        generator: source of every random draw, on the worlds' device; ``None`` makes one with seed 0.
+        device: ``auto``, ``cpu``, ``cuda`` or ``cuda:1``; ``auto`` takes the first GPU if there is one.
+        generator: source of all random numbers, on the worlds' device; ``None`` makes one with seed 0.
         model: robot and scene; ``None`` builds them from ``config``.
     """
 
@@ -212,10 +212,10 @@ class Worlds(Stateful):
         self.ball.fly(self.kinematics.paddle_path)
 
     def _react(self) -> None:
-        """Spread the ball's last impulse on the paddle over the coming control step.
+        """Distribute the ball's last impulse on the paddle over the coming control step.
 
-        A hit acts at the same place of the blade, which has moved on since; a contact that goes on (a ball that rests
-        on the blade) acts where it ended, at the end of the step.
+        A hit acts at the same point of the blade, which has moved since; a continuing contact (a ball that rests on the
+        blade) acts at its last contact point, at the end of the step.
         """
         events = self.ball.events
         on_blade = self.robot.paddle_position + events.hit_offset + (events.hit_point - events.hit_position)
@@ -230,8 +230,8 @@ class Worlds(Stateful):
         self._derive(mask)
 
     def reset_robot(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
-        """Put the robots of ``mask`` (N,) bool into qpos (N, 7 + J), qvel (N, 6 + J); sample their parameters."""
-        self.randomizer.draw(mask)
+        """Put the robots of ``mask`` (N,) bool into qpos (N, 7 + J), qvel (N, 6 + J); resample their parameters."""
+        self.randomizer.sample(mask)
         self._update_delay()
         self.engine.apply_params(mask)
         self.engine.reset(mask, qpos, qvel)
@@ -241,13 +241,13 @@ class Worlds(Stateful):
     def serve(self, mask: Tensor, position: Tensor, velocity: Tensor, spin: Tensor) -> None:
         """Start the ball of the worlds of ``mask`` at position (N, 3) m, velocity (N, 3) m/s, spin (N, 3) rad/s.
 
-        Give the same tensors each time: others are bound anew, which takes longer.
+        Give the same tensors each time: others are bound again, which takes longer.
         """
         self._serve(position, velocity, spin)(mask)
 
     def warn_of_overflow(self) -> None:
-        """Warn, once, when a world ever had more contacts or constraints than there is room for: the engine has dropped
-        the others. Waits for the device: ask once an update, not every step."""
+        """Warn, once, if a world ever had more contacts or constraints than the engine's memory holds: the engine has
+        dropped the others. Waits for the device: call it once an update, not every step."""
         if self._warned or not self.engine.overflowed():
             return
         self._warned = True
@@ -271,7 +271,7 @@ class Worlds(Stateful):
         return ball | events | {"previous_targets": self._previous_targets}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Put back what :meth:`state_dict` returned."""
+        """Load the result of :meth:`state_dict`."""
         self.randomizer.load_state_dict(under_prefix("drawn", state))
         self._update_delay()
         everyone = torch.ones(self.num_worlds, dtype=torch.bool, device=self.device)

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from pace.config.training import TrainConfig
 from pace.rl.practice import ServePractice
 from pace.sim.ball.ball import BallParams, BallSim
-from pace.sim.randomization import BALL_DRAWS, BALL_LIMITS
+from pace.sim.randomization import BALL_LIMITS, SAMPLED_BALL_PARAMS
 
 AXES = ("x", "y", "z")
 FAR_AWAY = 100.0  # m, where the paddle is
@@ -28,7 +28,7 @@ class ServePrior:
         ranges = {f"position_{axis}": getattr(serve, axis) for axis in AXES}
         ranges |= {f"velocity_{axis}": getattr(serve, f"v{axis}") for axis in AXES}
         ranges |= {f"spin_{axis}": serve.spin for axis in AXES}
-        for name, (range_name, scales) in BALL_DRAWS.items():
+        for name, (range_name, scales) in SAMPLED_BALL_PARAMS.items():
             nominal, (low, high) = float(getattr(ball, name)), getattr(draws, range_name)
             ranges[name] = [nominal * low, nominal * high] if scales else [nominal + low, nominal + high]
         ranges["delay"] = [bound / config.robot.control_dt for bound in config.sensing.mocap_delay]
@@ -85,7 +85,7 @@ class FlightModel:
         values, ball = self.prior.values(cube), self._ball
         for name, start in (("position", ball.position), ("velocity", ball.velocity), ("spin", ball.spin)):
             start.copy_(torch.stack([values[f"{name}_{axis}"] for axis in AXES], dim=1))
-        for name in BALL_DRAWS:
+        for name in SAMPLED_BALL_PARAMS:
             if name in values:
                 getattr(ball.params, name).copy_(values[name])
         return values
@@ -140,5 +140,5 @@ def _drawn(practice: ServePractice) -> dict[str, Tensor]:
     ball = practice.ball
     launch = {"position": ball.position, "velocity": ball.velocity, "spin": ball.spin}
     drawn = {f"{name}_{axis}": value[:, i].clone() for name, value in launch.items() for i, axis in enumerate(AXES)}
-    drawn |= {name: getattr(ball.params, name).clone() for name in BALL_DRAWS}
+    drawn |= {name: getattr(ball.params, name).clone() for name in SAMPLED_BALL_PARAMS}
     return drawn | {"delay": practice.sensing.delay.clone()}

@@ -1,6 +1,7 @@
-"""Table tennis as a task: serves, the referee, and what the ball's forecast asks of the robot.
+"""Table tennis as a task: serves, the referee, and the robot's targets from the ball's forecast.
 
-The kernels are in :mod:`pace.task.referee` and :mod:`pace.task.game_kernels`; here are their tensors and their order.
+The kernels are in :mod:`pace.task.referee` and :mod:`pace.task.game_kernels`; this module has their tensors and their
+order.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ __all__ = ["Game", "Outcome"]
 
 
 def rules_of(config: TaskConfig) -> Rules:
-    """The numbers of the configuration that the kernels need."""
+    """The kernels' numbers from the configuration."""
     serve, reset, reward = config.serve, config.reset, config.reward
     rules = Rules()
     rules.control_dt = config.robot.control_dt
@@ -42,7 +43,7 @@ def rules_of(config: TaskConfig) -> Rules:
 
 
 class Game(GameState, Stateful):
-    """Everything that the rules and the ball's forecast say about N worlds.
+    """Rules and ball forecast of N worlds.
 
     In each control step: :meth:`judge`, a forecast of the balls of ``referee.hit_now``, :meth:`close`; then
     :meth:`start_serve` after the forecast of new serves.
@@ -81,8 +82,8 @@ class Game(GameState, Stateful):
         self._judge()
 
     def close(self) -> None:
-        """Clock, forecasts of hits, ends: a serve that is cut off in flight is decided by its forecast; one that ends
-        without a hit is a miss, and a fall decides an open serve.
+        """Update clock, forecasts of hits and ends. The forecast decides a serve that is cut off in flight; a serve
+        that ends without a hit is a miss; a fall decides an open serve.
         """
         self._close()
 
@@ -96,10 +97,10 @@ class Game(GameState, Stateful):
         self._start_serve(mask)
 
     def start_episode(self, mask: Tensor, generator: torch.Generator) -> None:
-        """First serve of an episode; a world's first episode may begin at a random serve, so that ends spread out."""
+        """First serve of an episode. A world's first episode may begin at a random serve, to desynchronise the ends."""
         self._seed.random_(generator=generator)
         self._start_episode(mask)
 
     def state_tensors(self) -> dict[str, Tensor]:
-        """All tensors, by part and name; the point to stand by under the name that it has in checkpoints."""
+        """All tensors, by part and name; the idle point under its name in checkpoints."""
         return named_tensors(self) | {"target.idle_point": self.idle_point}

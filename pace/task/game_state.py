@@ -1,4 +1,4 @@
-"""What the rules know of N worlds: the parts of a :class:`pace.task.game.Game`, and the kernels' struct of them."""
+"""State of the rules in N worlds: the parts of a :class:`pace.task.game.Game`, and the kernels' struct of them."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ class ServeClock:
 
 @dataclass(eq=False)
 class Referee:
-    """What the referee knows of each serve.
+    """The referee's state of each serve.
 
     A hit is physical contact after exactly one bounce on the own half; a valid return then lands first on the
-    opponent's half (it may touch the net on the way). What is decided stays decided until the next serve.
-    Events of one kind after its first within a control step have no time of their own; they are taken to follow the
-    contact at once, which is exact unless a ball meets the table twice and the paddle within 20 ms.
+    opponent's half (it may touch the net on the way). A decided outcome does not change until the next serve.
+    Only the first event of each kind within a control step has a time. Later ones are assumed to follow the contact at
+    once, which is exact unless a ball meets the table twice and the paddle within 20 ms.
     """
 
     own_bounces: Int
@@ -43,7 +43,7 @@ class Referee:
 
 @dataclass(eq=False)
 class Target:
-    """Where and when the paddle should meet the ball: from the forecast of the serve. World frame, serve clock."""
+    """Position and time for the paddle to meet the ball, from the forecast of the serve. World frame, serve clock."""
 
     playable: Bool
     something_to_hit: Bool  # the ball can still be hit legally
@@ -66,7 +66,7 @@ class ReturnForecast:
 
 @dataclass(eq=False)
 class Closeness:
-    """How near the paddle came to the ball while it could be hit legally, over each serve."""
+    """Smallest distance of paddle and ball while the ball could be hit legally, over each serve."""
 
     nearest: InfFloat  # m, smallest distance from the face centre to the ball's surface so far
     previous: InfFloat  # m, the same a control step ago
@@ -76,7 +76,7 @@ class Closeness:
 
 @dataclass(eq=False)
 class StepEnds:
-    """What ended in the last control step."""
+    """Serves and episodes that ended in the last control step."""
 
     lost: Bool  # the robot fell or left its area
     over: Bool  # the serve ended
@@ -100,4 +100,4 @@ class GameState:
 
 @struct_of(GameState)
 class GameArrays:
-    """:class:`GameState` as kernels see it."""
+    """:class:`GameState` in the kernels' form."""

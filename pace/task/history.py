@@ -15,10 +15,10 @@ from pace.task.signals import put
 
 
 class Frame:
-    """Observations that are side by side in a frame.
+    """Observations that are concatenated to a frame.
 
-    A signal that lies where it lay before is read there; another one, which its function computes, is kept in a tensor
-    of its own. Which of them it is, is seen at the start, so a function must do the same each time.
+    If a function returns the same memory each time, its signal is read in place; if it returns a new tensor each time,
+    the signal is copied to a separate tensor. This is checked once, at the start, so a function must not change it.
 
     Attributes: ``tensors``, (N, size) float32 each, with the values of the last :meth:`compute`.
 
@@ -29,7 +29,7 @@ class Frame:
         self.tensors: list[Tensor] = []
         self._computed: list[tuple[Callable[[], Tensor], Tensor]] = []
         for function in functions:
-            signal, again = function(), function()  # both at once, or the second could lie where the first was
+            signal, again = function(), function()  # both alive, or the second could reuse the memory of the first
             if signal.data_ptr() != again.data_ptr() or signal.dtype != torch.float32:
                 signal = signal.float()
                 self._computed.append((function, signal))
@@ -61,7 +61,7 @@ class History(Stateful):
         self.frames = self.observation.view(count, frames, size)
 
     def push(self) -> None:
-        """Append a frame made of the present signals."""
+        """Append a frame made of the current signals."""
         self._signals.compute()
         torch.cat(self._signals.tensors, dim=1, out=self.frame)
         for older in range(self.frames.shape[1] - 1):  # twice as fast as a kernel, which Warp does not vectorise
@@ -69,7 +69,7 @@ class History(Stateful):
         self.frames[:, -1].copy_(self.frame)
 
     def fill(self, mask: Tensor) -> None:
-        """Set all frames of the worlds of ``mask`` (N,) bool to one made of the present signals."""
+        """Set all frames of the worlds of ``mask`` (N,) bool to one made of the current signals."""
         self._signals.compute()
         rows = mask.nonzero().squeeze(1) if mask.device.type == "cpu" else slice(None)
         frame = torch.cat([signal[rows] for signal in self._signals.tensors], dim=1)

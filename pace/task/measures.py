@@ -1,4 +1,4 @@
-"""What rewards and the critic share: quantities of N worlds, and the kernels' structs of them."""
+"""Quantities that rewards and the critic share, of N worlds, and the kernels' structs of them."""
 
 from __future__ import annotations
 
@@ -10,30 +10,30 @@ from pace.arrays.tensors import Bool, Float, Vec2, Vec3, struct_of
 
 @dataclass(eq=False)
 class Derived:
-    """What follows from robot, ball and game, and changes with a new serve. World frame."""
+    """Quantities derived from robot, ball and game; they change with a new serve. World frame."""
 
-    base_error: Vec2  # m, from the base to where it should stand, for the rewards
-    shift: Vec2  # m, the same as the networks see it
-    apex: Vec3  # m, the point to stand by where there is nothing to hit
+    base_error: Vec2  # m, from the base to its target, for the rewards
+    shift: Vec2  # m, the same for the networks
+    apex: Vec3  # m, the idle point if there is nothing to hit
     target: Vec3  # m, the same
-    arrival: Float  # s until the ball is at the target, 0 where there is nothing to hit
+    arrival: Float  # s until the ball is at the target, 0 if there is nothing to hit
     foot_load: Annotated[Float, "feet"]  # N
     foot_contact: Annotated[Bool, "feet"]
     feet_distance: Float  # m
     paddle_to_target: Vec3  # m
     joint_offset: Annotated[Float, "joints"]  # rad from the nominal pose
     serve_progress: Float  # share of the longest serve
-    episode_progress: Float  # share of the episode's serves, 0 where episodes do not end
+    episode_progress: Float  # share of the episode's serves, 0 if episodes do not end
 
 
 @struct_of(Derived)
 class DerivedArrays:
-    """:class:`Derived` as kernels see it."""
+    """:class:`Derived` in the kernels' form."""
 
 
 @dataclass(eq=False)
 class Measures:
-    """What reward terms measure on robots."""
+    """Quantities of the robots for the reward terms."""
 
     joint_power: Float  # W, norm over the joints of torque times velocity
     ankle_power: Float  # W, of the ankles alone
@@ -58,4 +58,4 @@ class Measures:
 
 @struct_of(Measures)
 class MeasureArrays:
-    """:class:`Measures` as kernels see it."""
+    """:class:`Measures` in the kernels' form."""

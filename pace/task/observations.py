@@ -1,12 +1,11 @@
 """Observations of actor and critic: two tables from name to (size, function), and their histories.
 
-The functions of :data:`POLICY` take :class:`pace.onboard.actor.Signals`, which hold nothing but sensed signals and what
-the robot computes from them, in the environment and in the exported file; those of :data:`CRITIC` take
-:class:`TaskState`, the truth. So the actor cannot see the truth by accident: a privileged name in the policy's list is
-a configuration error.
+The functions of :data:`POLICY` take :class:`pace.onboard.actor.Signals`: only sensed signals and the robot's estimates
+from them, in the environment and in the exported file. Those of :data:`CRITIC` take :class:`TaskState`, the truth. So
+the actor cannot see the truth by accident: a privileged name in the policy's list is a configuration error.
 
 Both tables take observations from outside (:mod:`pace.config.plugins`): in the list of names, an entry point or the
-import path of an :class:`ActorObservation` or :class:`CriticObservation`. The type tells for whom it is.
+import path of an :class:`ActorObservation` or :class:`CriticObservation`. The type decides the group.
 
 A group's observation (N, H * D) is its last H frames of D numbers, oldest first.
 """
@@ -28,7 +27,7 @@ from pace.onboard.estimate import columns
 from pace.onboard.estimates import ESTIMATES, check
 from pace.task.state import TaskState
 
-#: How many numbers an observation has, or a function that says it for a robot with so many joints.
+#: The numbers of an observation, or a function of the robot's number of joints that returns it.
 Size = int | Callable[[int], int]
 
 
@@ -55,7 +54,7 @@ def _column(values: Tensor) -> Tensor:
     return values.unsqueeze(-1)
 
 
-#: Sensed, delayed, noisy signals, and what is computed from them in each control step.
+#: Sensed, delayed, noisy signals, and quantities computed from them in each control step.
 SENSED: dict[str, ActorObservation] = {
     "base_angular_velocity": ActorObservation(3, lambda s: s.sensing.base_angular_velocity),
     "base_position": ActorObservation(3, lambda s: s.sensing.base_position),
@@ -88,7 +87,7 @@ def _only(kind: type[Observation]) -> Callable[[object], Observation]:
 
 
 class PolicyObservations(Registry[ActorObservation]):
-    """``SENSED``, the parts of the estimates that are for the actor, as ``ESTIMATES`` has them now, and others."""
+    """``SENSED``, the actor's parts of the estimates that ``ESTIMATES`` has now, and others."""
 
     def __missing__(self, name: str) -> ActorObservation:
         for estimate, entry in ESTIMATES.items():
@@ -115,10 +114,10 @@ def _part_of(estimate: str, part: str) -> ActorObservation:
     )
 
 
-#: What the actor can see: ``SENSED`` and the estimates.
+#: The actor's observations: ``SENSED`` and the estimates.
 POLICY = PolicyObservations("name", OBSERVATIONS, _only(ActorObservation), SENSED)
 
-#: What the critic can see: the truth.
+#: The critic's observations: the truth.
 CRITIC: Registry[CriticObservation] = Registry("name", CRITIC_OBSERVATIONS, _only(CriticObservation))
 CRITIC |= {
     "base_angular_velocity": CriticObservation(3, lambda s: s.robot.base_angular_velocity),
@@ -153,7 +152,7 @@ Table = Mapping[str, ActorObservation] | Mapping[str, CriticObservation]
 
 
 def check_policy(config: TaskConfig) -> None:
-    """Raise :class:`ConfigError` for a name that the actor may not see, or that nobody computes."""
+    """Raise :class:`ConfigError` for a name that is privileged or unknown."""
     names, predictor = config.observation.policy, config.predictor
     _check_names("policy", names, POLICY)
     check(config)

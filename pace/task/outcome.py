@@ -1,10 +1,10 @@
-"""How a serve can end."""
+"""Outcomes of a serve."""
 
 from enum import IntEnum
 
 
 class Outcome(IntEnum):
-    """How a serve ended. All but ``OPEN`` and ``BAD_SERVE`` count in the rates."""
+    """Outcome of a serve. All but ``OPEN`` and ``BAD_SERVE`` count in the rates."""
 
     OPEN = 0  # not decided yet
     SUCCESS = 1  # hit, then landed first on the opponent's half

@@ -1,4 +1,4 @@
-"""Where serves and robots start: samplers over N worlds."""
+"""Initial states of serves and robots: samplers over N worlds."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from pace.arrays.draws import Column, Draws, columns_of
+from pace.arrays.draws import Column, UniformSampler, columns_of
 from pace.arrays.launch import Launch
 from pace.config.sim import RobotConfig
 from pace.config.task import ResetConfig, ServeConfig
@@ -23,7 +23,7 @@ def turn(yaw: wp.array[wp.float32], qpos: wp.array2d[wp.float32]):
 
 
 class ServeSampler:
-    """Draws where serves start and how fast they are."""
+    """Samples the initial position, velocity and spin of serves."""
 
     def __init__(
         self, config: ServeConfig, num_worlds: int, generator: torch.Generator, device: torch.device | str
@@ -31,33 +31,33 @@ class ServeSampler:
         launch = torch.zeros(num_worlds, 9, device=device)
         self._launch = launch[:, :3], launch[:, 3:6], launch[:, 6:]
         ranges = [config.x, config.y, config.z, config.vx, config.vy, config.vz, config.spin, config.spin, config.spin]
-        self._draw = Draws(columns_of(launch, ranges), generator)
+        self._sample = UniformSampler(columns_of(launch, ranges), generator)
 
     def sample(self, mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Position m, velocity m/s and spin rad/s, each (N, 3), world frame: new in the worlds of ``mask`` (N,) bool.
 
-        The tensors are the same ones each time.
+        The tensors are allocated once and updated in place.
         """
-        self._draw(mask)
+        self._sample(mask)
         return self._launch
 
 
 class HeadStart:
-    """Puts balls that are being served somewhere further on their way, by a time drawn from ``config.head_start``."""
+    """Moves served balls forward on their flight, by a time sampled from ``config.head_start``."""
 
     def __init__(self, config: ServeConfig, ball: BallSim, generator: torch.Generator) -> None:
         duration = torch.zeros(ball.num_worlds, device=ball.device)
-        self._draw = Draws([Column(duration, *config.head_start)], generator)
+        self._sample = UniformSampler([Column(duration, *config.head_start)], generator)
         self._skip = ball.skipper(duration)
 
     def give(self, mask: Tensor) -> None:
-        """Another time for each world of ``mask`` (N,) bool; its ball moves on by that."""
-        self._draw(mask)
+        """Sample a time for each world of ``mask`` (N,) bool and move its ball forward by it."""
+        self._sample(mask)
         self._skip(mask)
 
 
 class PoseSampler:
-    """Draws the state in which a robot starts an episode."""
+    """Samples the state in which a robot starts an episode."""
 
     def __init__(
         self,
@@ -80,15 +80,15 @@ class PoseSampler:
         ends = zip(*(limit.tolist() for limit in limits), strict=True)
         ranges = _joint_ranges(config, RobotSpec.of(robot), nominal.tolist())
         columns += columns_of(self._qpos[:, 7:], [(*pair, *end) for pair, end in zip(ranges, ends, strict=True)])
-        self._draw = Draws(columns, generator)
+        self._sample = UniformSampler(columns, generator)
         self._turn = Launch(turn, num_worlds, device, yaw=yaw, qpos=self._qpos)
 
     def sample(self, mask: Tensor) -> tuple[Tensor, Tensor]:
         """qpos (N, 7 + J) and qvel (N, 6 + J) of MuJoCo; joints within their limits and at rest.
 
-        New in the worlds of ``mask`` (N,) bool; the tensors are the same ones each time.
+        New in the worlds of ``mask`` (N,) bool; the tensors are allocated once and updated in place.
         """
-        self._draw(mask)
+        self._sample(mask)
         self._turn()
         return self._qpos, self._qvel
 

@@ -1,4 +1,4 @@
-"""What the robot senses and computes, in N worlds: the on-board steps, run in place on tensors that stay."""
+"""Sensed signals and on-board estimates of N worlds: tensors that are allocated once and updated in place."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from pace.sim.sensing import Sensing
 
 
 class ActorSignals(Signals):
-    """All that the actor may see, of N worlds in place: each control step overwrites the same tensors.
+    """All inputs of the actor, of N worlds: each control step overwrites the same tensors.
 
     Besides the attributes of :class:`pace.onboard.actor.Signals`: ``onboard``, the modules that compute them, and
-    ``predictor``, the one that is used.
+    ``predictor``, if there is one.
 
     Args:
         config: the task.
@@ -40,11 +40,11 @@ class ActorSignals(Signals):
 
     @property
     def predictor(self) -> Predictor | None:
-        """The predictor that is used, if any."""
+        """The predictor, if any."""
         return self.onboard.predictor
 
     def step(self, new_ball: Tensor) -> None:
-        """One control step later: ``sensing`` and ``action`` are new; ``new_ball`` (N,) bool: balls just launched."""
+        """Update after a control step: ``sensing`` and ``action`` are new; ``new_ball`` (N,) bool: just launched."""
         with torch.no_grad(), torch.autocast(self.action.device.type, enabled=False):
             found = self.onboard(self.sensing, self.action, self.track, self.estimates, new_ball)
         if self.predictor is not None:
@@ -54,9 +54,9 @@ class ActorSignals(Signals):
             kept.copy_(new[name])
 
     def begin(self, mask: Tensor) -> None:
-        """A new episode in the worlds of ``mask`` (N,) bool; the others stay as they are.
+        """A new episode in the worlds of ``mask`` (N,) bool; the others do not change.
 
-        On a CPU only those worlds are computed: looking costs no wait there, and few are new.
+        On a CPU only those worlds are computed: reading the mask costs no wait there, and few worlds are new.
         """
         rows = mask.nonzero().squeeze(1) if mask.device.type == "cpu" else slice(None)
         with torch.no_grad(), torch.autocast(self.action.device.type, enabled=False):
@@ -69,7 +69,7 @@ class ActorSignals(Signals):
 
 
 def _allocate(onboard: Onboard, readings: Readings, action: Tensor) -> Signals:
-    """Zeros of the shapes of one step, made without a step: no predictor is asked."""
+    """Zeros of the shapes of one step, made without calling a predictor."""
     count = len(action)
 
     def zeros(*size: int, dtype: torch.dtype = torch.float32) -> Tensor:
@@ -93,8 +93,8 @@ def _allocate(onboard: Onboard, readings: Readings, action: Tensor) -> Signals:
 
 
 def put(kept: Tensor, new: Tensor, mask: Tensor, rows: Tensor | slice) -> None:
-    """Write ``new`` into the worlds of ``mask`` (N,) of ``kept`` (N, ...): the values of ``rows``, which are those
-    worlds, or of all, without looking which worlds they are."""
+    """Write ``new`` into the worlds of ``mask`` (N,) of ``kept`` (N, ...). ``new`` holds the values of ``rows``, which
+    are those worlds, or without ``rows`` the values of all worlds."""
     if isinstance(rows, Tensor):
         kept[rows] = new
     else:

@@ -1,4 +1,4 @@
-"""What rewards and the critic read: the true state of N worlds, and quantities that several of them share."""
+"""The true state of N worlds, for rewards and the critic, and quantities that several of them share."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class TaskState(Derived, Stateful):
     """True state of the task after a control step. Privileged: the actor never reads it.
 
     Attributes, besides those of :class:`Derived`: ``robot``, ``ball`` (simulation), ``game`` (rules and forecast),
-    ``action`` and ``previous_action`` (N, J); ``mocap_delay`` (N,) control steps by which motion capture is late;
-    ``nominal`` (J,) rad, ``joint_range`` the middle of the joints' ranges and the way from there to their ends, (J,)
+    ``action`` and ``previous_action`` (N, J); ``mocap_delay`` (N,) control steps, delay of the motion capture;
+    ``nominal`` (J,) rad, ``joint_range`` the middle of the joints' ranges and half of their widths, (J,)
     rad each; ``something_to_hit``, ``lost`` (N,) bool. After :meth:`refresh`: ``measures``, those of
     :class:`Measures` by name.
     """
@@ -84,5 +84,5 @@ class TaskState(Derived, Stateful):
         self._measure()
 
     def derive(self) -> None:
-        """Compute those again that change with a new serve."""
+        """Recompute those that change with a new serve."""
         self._derive()

@@ -1,4 +1,4 @@
-"""What reward terms measure on robots, as a Warp kernel, one thread a world. See :mod:`pace.task.state`."""
+"""Quantities of the robots for the reward terms, as a Warp kernel, one thread a world. See :mod:`pace.task.state`."""
 
 import warp as wp
 
@@ -9,13 +9,13 @@ from pace.task.game_state import GameArrays
 from pace.task.measures import DerivedArrays, MeasureArrays
 from pace.task.rules import Rules, something_to_hit_now
 
-#: A foot that pushes with less touches nothing, N.
+#: Contact threshold of a foot's force, N.
 CONTACT_FORCE = wp.constant(1.0)
 
 
 @wp.struct
 class JointArrays:
-    """Per joint: its nominal position, rad, and 1 where it belongs to a group of ``JOINT_GROUPS``."""
+    """Per joint: its nominal position, rad, and 1 if it belongs to a group of ``JOINT_GROUPS``."""
 
     nominal: wp.array[wp.float32]
     ankles: wp.array[wp.float32]
@@ -108,8 +108,8 @@ def measure(
     base_error: wp.array[wp.vec2],
     measures: MeasureArrays,
 ):
-    """Sums over the joints and feet of one world, its base's motion, and how far paddle and base are from where they
-    should be."""
+    """Sums over the joints and feet of one world, its base's motion, and the errors of paddle and base to their
+    targets."""
     world = wp.tid()
     _measure_joints(robot, action, previous_action, joints, measures, world)
     _measure_feet(robot, foot_contact, measures, world)
@@ -148,7 +148,7 @@ def derive(
     nominal: wp.array[wp.float32],
     rules: Rules,
 ):
-    """Shared quantities of one world from its present state."""
+    """Shared quantities of one world from its current state."""
     world = wp.tid()
     something = something_to_hit_now(game, ball, rules, world)
     game.target.something_to_hit[world] = something

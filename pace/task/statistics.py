@@ -1,4 +1,4 @@
-"""Counts of what happened in N worlds, summed on the device until somebody asks."""
+"""Counts of events in N worlds, summed on the device until they are read."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Statistics(Stateful):
     STATE = ("sums",)
 
     def __init__(self, game: Game, first_counted: Tensor) -> None:
-        """Of ``game``, where a world's serves count from number ``first_counted`` (0-d) on."""
+        """Of ``game``; a world's serves count from number ``first_counted`` (0-d) on."""
         played = game.clock.played
         self.sums = torch.zeros(len(NAMES), device=played.device)
         first = first_counted.view(1)
@@ -80,7 +80,7 @@ class Statistics(Stateful):
         self._count()
 
     def pop(self) -> dict[str, Tensor]:
-        """The sums by name, as 0-d tensors; starts anew."""
+        """The sums by name, as 0-d tensors; then set them to zero."""
         popped = dict(zip(NAMES, self.sums.clone().unbind(), strict=True))
         self.sums.zero_()
         return popped

@@ -1,5 +1,5 @@
-"""A policy to look at: the page in a browser, and films.
+"""Watching a policy: a live page in the browser, and videos.
 
-Here belongs what draws and plays back; not the drawing of a scene itself (``sim.render``). Imports ``evaluation`` and
-the rooms below. ``python -m pace.viewer RUN`` plays.
+Playback and display belong here; rendering a scene (``sim.render``) does not. Imports ``evaluation`` and the rooms
+below. ``python -m pace.viewer RUN`` plays.
 """

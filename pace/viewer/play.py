@@ -1,4 +1,4 @@
-"""A policy to watch, from its configuration: a live page, or a film."""
+"""The command ``pace play``: a live page or a video of a policy."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from pace.viewer.web import Page
 
 
 def play_from_config(composed: DictConfig) -> None:
-    """Play as the composed configuration says, and print where to look."""
+    """Play as configured, and print the address or the file."""
     config = parse(composed, PlayConfig)
-    assert config.run is not None  # PlayConfig has seen to it
+    assert config.run is not None  # guaranteed by PlayConfig
     policy = load_policy(config.run)
     overrides = [f"engine.physics_dt={config.physics_dt}", *config.overrides]
     if config.video:
@@ -41,7 +41,7 @@ def page(config: PlayConfig, policy: TaskPolicy, overrides: list[str]) -> None:
 
 
 def film(config: PlayConfig, policy: TaskPolicy, overrides: list[str]) -> None:
-    """Write the film."""
+    """Write the video."""
     assert config.video
     file, show = Path(config.video), Show(policy, overrides, config.seed)
     total = round(config.seconds * config.fps / config.speed)

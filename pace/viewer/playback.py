@@ -1,4 +1,4 @@
-"""One world to watch: serve after serve, the state at any instant between control steps, and what the robot believes.
+"""One world to watch: serve after serve, the state at any instant between control steps, and the robot's estimates.
 
 The page and the video of :mod:`pace.viewer` draw what :meth:`Show.advance` returns.
 """
@@ -26,7 +26,7 @@ from pace.task.resets import ServeSampler
 
 Array = NDArray[np.float64]
 
-#: What a show changes in the saved task, before the user's own changes: the paper's evaluation, one world on a CPU.
+#: Overrides of the saved task in a show, before the user's: the paper's evaluation, one world on a CPU.
 SHOW_OVERRIDES = ("serve=mixed", "reset=evaluation", *ON_A_CPU)
 FLIGHT_DT = 0.01  # s between the points of a flight line
 FLIGHT_POINTS = 200
@@ -68,9 +68,9 @@ class Serve:
 
 
 class ChosenServes(ServeSampler):
-    """Draws serves as the task does, or gives the chosen one.
+    """Samples serves as the task does, or returns the chosen one.
 
-    Attributes: ``choice``, ``None`` for drawn serves.
+    Attributes: ``choice``, ``None`` for random serves.
     """
 
     choice: Serve | None = None
@@ -100,22 +100,22 @@ class ShowEnv(TableTennisEnv):
         )
 
     def end_serve(self) -> None:
-        """The present serve's time is up; the next one begins with the next control step."""
+        """End the current serve; the next one begins with the next control step."""
         self.game.clock.time.fill_(self.config.serve.max_duration)
 
 
 class FlightLine:
-    """The flight that a ball has ahead of it, if nobody touches it."""
+    """The coming flight of a ball, if no paddle touches it."""
 
     def __init__(self, config: TaskConfig) -> None:
         params = BallParams.from_config(config.ball)
         self._ball = BallSim(1, "cpu", params, config.ball.table, FLIGHT_DT, 1, config.engine.ball_dt)
         self._far = torch.zeros(1, 2, 12)
-        self._far[..., 2] = 100.0  # m: a paddle in nobody's way
+        self._far[..., 2] = 100.0  # m: a paddle out of reach
         self._far[..., 3] = 1.0
 
     def points(self, ball: BallSim) -> Array:
-        """(M, 3) m, from the present state of the world of ``ball`` until the floor."""
+        """(M, 3) m, from the current state of the world of ``ball`` until the floor."""
         own, events = self._ball, self._ball.events
         for f in fields(BallParams):
             getattr(own.params, f.name).copy_(getattr(ball.params, f.name))
@@ -134,7 +134,7 @@ class FlightLine:
 
 @dataclass
 class Score:
-    """Serves played to their end, and what became of them."""
+    """Counts of finished serves and their outcomes."""
 
     serves: int = 0
     hits: int = 0
@@ -150,7 +150,7 @@ class Score:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """What there is to draw at one instant, world frame, m. ``flight_number`` counts the flight lines."""
+    """Everything to draw at one instant, world frame, m. ``flight_number`` counts the flight lines."""
 
     qpos: Array  # (28,)
     ball: Array  # (3,)
@@ -174,7 +174,7 @@ class Snapshot:
 
 
 class Show:
-    """A policy that plays serve after serve in one world; after a fall the robot starts anew.
+    """A policy that plays serve after serve in one world; after a fall the robot is reset.
 
     Attributes: ``env``, ``score``.
 
@@ -199,13 +199,13 @@ class Show:
         self._step()
 
     def next_serve(self, serve: Serve | None) -> None:
-        """End the present serve, which then does not count; ``serve`` is played from now on, ``None``: drawn ones."""
+        """End the current serve, which then does not count; play ``serve`` from now on, or random ones if ``None``."""
         self.choose(serve)
         self.env.end_serve()
         self._skipped = True
 
     def choose(self, serve: Serve | None) -> None:
-        """What is served after the present ball."""
+        """The next serve."""
         self.env.chosen.choice = serve
 
     @property
@@ -214,7 +214,7 @@ class Show:
         return self.env.worlds.control_dt
 
     def advance(self, seconds: float) -> Snapshot:
-        """What there is to see ``seconds`` of play later."""
+        """The snapshot after ``seconds`` more of play."""
         self._ahead += seconds
         while self._ahead > self.control_dt:
             self._ahead -= self.control_dt
@@ -235,7 +235,7 @@ class Show:
             self._see_flight()
 
     def _knots(self) -> tuple[list[float], Array]:
-        """Times (s into the step) and places (K, 3) of the ball between which it goes straight on."""
+        """Times (s into the step) and positions (K, 3) of the ball, to interpolate linearly."""
         events, ball = self.env.worlds.ball.events, self.env.worlds.ball
         bounce = min(float(events.own_bounce_time), float(events.opponent_bounce_time))
         knots = [(0.0, self._ball_before)]

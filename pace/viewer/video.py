@@ -1,4 +1,4 @@
-"""The film of :mod:`pace.viewer`: the scene from the side and from the top, with the same marks as the page."""
+"""The video of :mod:`pace.viewer`: the scene from the side and from the top, with the same marks as the page."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ def side_camera() -> mujoco.MjvCamera:
 
 
 def pictures(show: Show, seconds: float, fps: int, speed: float, width: int, height: int) -> Iterator[Picture]:
-    """``seconds`` of play at ``fps`` pictures a second of film, time slowed by ``speed``: uint8 (2 height, width, 3).
+    """``seconds`` of play at ``fps`` frames a second of video, time slowed by ``speed``: uint8 (2 height, width, 3).
 
-    Errors: :class:`pace.sim.render.RenderError` where there is no OpenGL.
+    Errors: :class:`pace.sim.render.RenderError` without OpenGL.
     """
     config = show.env.config
     model = build_model(config.robot, config.engine, config.ball.table, visual=True)
@@ -50,16 +50,16 @@ def write_video(
     height: int,
     on_picture: Callable[[], None] = lambda: None,
 ) -> None:
-    """Write a film as H.264.
+    """Write a video as H.264.
 
-    Errors: :class:`pace.sim.render.RenderError` where OpenGL or a package is missing, or the file cannot be written.
+    Errors: :class:`pace.sim.render.RenderError` if OpenGL or a package is missing, or the file cannot be written.
     """
     try:
         import imageio_ffmpeg
     except ImportError as error:
         raise RenderError(f"{error}: pip install 'pace-table-tennis[viewer]'") from error
     film = pictures(show, seconds, fps, speed, width, height)
-    first = next(film)  # before the file is made: without OpenGL there is none
+    first = next(film)  # fails without OpenGL, before the file is made
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         file.touch()  # the encoder would only report a broken pipe

@@ -1,7 +1,7 @@
 """The live page of :mod:`pace.viewer`: the scene in a browser, with controls. Needs the extra ``viewer``.
 
-The browser's events arrive on threads of the server; they only put requests into a queue, which the one loop that
-plays and draws works off.
+The browser's events arrive on threads of the server. They only put requests into a queue; one loop handles them, rolls
+out and draws.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ from pace.viewer.playback import (
 )
 
 FRAME = 1.0 / 30.0  # s between pictures
-LONGEST_FRAME = 0.1  # s: a page that was held up does not make up for it
-IDLE = 0.1  # s between looks whether somebody has come
+LONGEST_FRAME = 0.1  # s: a page does not catch up after a longer delay
+IDLE = 0.1  # s between checks for a connected browser
 LOOK_FOR_CHECKPOINTS = 5.0  # s: a training run may write new ones
-CAMERA, LOOK_AT = (-2.9, -2.6, 1.7), (-0.7, 0.0, 0.8)  # m, where a browser starts
+CAMERA, LOOK_AT = (-2.9, -2.6, 1.7), (-0.7, 0.0, 0.8)  # m, the first view
 #: Sliders of a serve: label, least, largest, step, start, hint. In the order of :class:`Serve`.
 SERVE_SLIDERS = (
     ("Speed (m/s)", 4.5, 7.5, 0.05, 5.8, "over the ground"),
@@ -60,7 +60,7 @@ class PageError(RuntimeError):
 
 
 def require_viewer() -> None:
-    """Errors: :class:`PageError` where the packages of the page are missing."""
+    """Errors: :class:`PageError` if the packages of the page are missing."""
     try:
         import mjviser
     except ImportError as error:
@@ -69,7 +69,7 @@ def require_viewer() -> None:
 
 
 def require_port(host: str, port: int) -> None:
-    """Errors: :class:`PageError` when ``port`` of ``host`` is taken, or not ours to open."""
+    """Errors: :class:`PageError` if ``port`` of ``host`` is in use or may not be opened."""
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
         socket.create_server((host, port), family=family).close()
@@ -86,7 +86,7 @@ def checkpoints_of(policy: TaskPolicy) -> list[Path]:
 
 
 class Page:
-    """Plays a policy in the browsers that look at it, at real time or slower.
+    """Shows a policy in all connected browsers, in real time or slower.
 
     Attributes: ``show``, ``server`` (viser), ``url``.
 
@@ -94,9 +94,9 @@ class Page:
         policy: as :func:`pace.rl.load_policy` gives it.
         overrides: of the saved task.
         balls: names of ball presets to choose from.
-        host, port: where to listen. A host other than the local one lets everybody in reach watch and press buttons.
+        host, port: to listen on. With another host than the local one, everybody in its network has the controls.
         speed: of time, 1 for real time.
-        seed: of all draws.
+        seed: of all random numbers.
 
     Errors: :class:`PageError`; :class:`pace.config.ConfigError` for wrong overrides.
     """
@@ -120,9 +120,9 @@ class Page:
         self._policy = policy
         self._requests: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self.show = Show(policy, overrides, seed)
-        with redirect_stdout(StringIO()):  # its own banner
+        with redirect_stdout(StringIO()):  # hides its banner
             self.server = viser.ViserServer(host=host, port=port, label="PACE", verbose=False)
-        if self.server.get_port() != port:  # somebody was quicker
+        if self.server.get_port() != port:  # another process took it first
             self.server.stop()
             raise PageError(f"port {port} of {host} was taken just now: give another port=")
         self.url = f"http://{host}:{port}"
@@ -131,7 +131,7 @@ class Page:
         self._drawn_flight = 0
         self._next_look = 0.0
 
-    # --- what is to be seen -------------------------------------------------------------------------------------------
+    # --- scene --------------------------------------------------------------------------------------------------------
 
     def _build_scene(self) -> None:
         from mjviser import ViserMujocoScene
@@ -152,7 +152,7 @@ class Page:
         return self.server.scene.add_icosphere(f"/marks/{name}", radius, _rgb(colour), cast_shadow=False)
 
     def draw(self, snapshot: Snapshot) -> None:
-        """Send what has changed to the browsers."""
+        """Send all changes to the browsers."""
         self._data.qpos[:] = snapshot.qpos
         self._data.mocap_pos[0] = snapshot.ball
         mujoco.mj_kinematics(self._scene.mj_model, self._data)
@@ -212,7 +212,7 @@ class Page:
 
     @property
     def serve(self) -> Serve | None:
-        """What the sliders say, or ``None`` for random serves."""
+        """The serve of the sliders, or ``None`` for random serves."""
         return None if self._random.value else Serve(*(float(slider.value) for slider in self._sliders))
 
     def _ask(self, request: Callable[[], None]) -> None:
@@ -242,7 +242,7 @@ class Page:
         self._restart(policy, self._ball)
 
     def _restart(self, policy: TaskPolicy, ball: str | None) -> None:
-        """Another policy or another ball: a new show, with a new score."""
+        """Start a new show, with a new score, for another policy or another ball."""
         chosen = [f"ball={ball}"] if ball else []
         try:
             self.show = Show(policy, [*self._overrides, *chosen], self._seed)
@@ -264,7 +264,7 @@ class Page:
     # --- the loop -----------------------------------------------------------------------------------------------------
 
     def run(self, ended: Callable[[], bool] = lambda: False) -> None:
-        """Play while somebody looks, until ``ended`` or Ctrl-C; then close the server."""
+        """Play while a browser is connected, until ``ended`` or Ctrl-C; then close the server."""
         try:
             before = time.monotonic()
             while not ended():

@@ -99,7 +99,7 @@ def test_tensors_are_kept_alive() -> None:
         ({"values": torch.ones(3)}, r"argument 'values' must be .* not torch.float32 \(3,\)"),
         ({"values": torch.ones(2, 3, 3)}, r"argument 'values' must be .* not torch.float32 \(2, 3, 3\)"),
         ({"values": torch.ones(2, 3).double()}, r"argument 'values' must be torch.float32 .* not torch.float64"),
-        ({"values": torch.ones(3, 2).T}, "argument 'values' must hold the numbers of each vector side by side"),
+        ({"values": torch.ones(3, 2).T}, "argument 'values' must hold the numbers of each vector contiguously"),
         ({"values": torch.ones(2, 3, device="meta")}, "argument 'values' must lie on cpu, not on meta"),
         ({"values": 1.0}, r"kernel '_scale', argument 'values' must be a tensor, not 1\.0"),
         ({"mask": torch.ones(2)}, r"argument 'mask' must be torch.bool of shape \(\*\), not torch.float32"),

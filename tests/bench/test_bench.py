@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from pace.bench import physics, report, training
-from pace.bench.environment import EnvironmentCrew
+from pace.bench.environment import EnvironmentProcesses
 from pace.bench.measure import measure
 from pace.bench.physics import RawMujoco
 from pace.bench.timing import median_seconds
@@ -90,14 +90,14 @@ def test_native_rates_are_of_n_and_of_twice_as_many_worlds(monkeypatch: pytest.M
 
 
 def test_a_crew_plays_its_share_in_each_process_and_tells_of_one_that_failed() -> None:
-    with EnvironmentCrew(bench_config(), "native", 2) as crew:
-        crew.run()
-        assert [process.is_alive() for process in crew._processes] == [True, True]
-        crew._processes[1].kill()
-        crew._processes[1].join()
-        with pytest.raises(BenchError, match="crew"):
-            crew.run()
-    assert not crew._processes[0].is_alive()
+    with EnvironmentProcesses(bench_config(), "native", 2) as processes:
+        processes.run()
+        assert [process.is_alive() for process in processes._processes] == [True, True]
+        processes._processes[1].kill()
+        processes._processes[1].join()
+        with pytest.raises(BenchError, match="processes"):
+            processes.run()
+    assert not processes._processes[0].is_alive()
 
 
 def test_ratios_and_table_of_known_figures() -> None:

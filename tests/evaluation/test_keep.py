@@ -67,7 +67,7 @@ def test_the_card_says_what_it_is_and_how_to_play_its_table(tmp_path: Path) -> N
     command = "physics_dt=0.002 num_worlds=256 warmup_serves=2 seed=1 serves=5120 sensing=paper"
     assert f"`python -m pace.evaluation pretrained/mine {command}`" in text
     assert "| mid-long | 5,120 | 99.5 (99.1 to 99.7) | 97.1 (96.5 to 97.6) | 0.4 |" in text
-    assert "What it survives" not in text
+    assert "Robustness sweep" not in text
 
 
 @pytest.mark.parametrize("case", ["no run", "no evaluation", "no notes"])

@@ -9,7 +9,7 @@ import torch
 
 from pace.config.base import ConfigError
 from pace.config.training import SchedulePoint
-from pace.distributed import Team
+from pace.distributed import ProcessGroup
 from pace.rl.agent import Agent, Policy, RunningNorm, compute_dtype, scheduled
 from tests.helpers.algo import CPU, small_algo
 
@@ -52,7 +52,7 @@ def test_running_norm_remembers_a_value_that_is_not_finite(bad: float) -> None:
 def test_a_norm_that_does_not_learn_clips_in_the_observations_own_units() -> None:
     norm = RunningNorm(2, clip=5.0, learns=False)
     norm.update(torch.full((8, 2), 3.0))
-    norm.pool(norm.moments(), Team(0, 2))  # nothing to add up, and nobody is asked
+    norm.pool(norm.moments(), ProcessGroup(0, 2))  # nothing to add up, and nobody is asked
     torch.testing.assert_close(norm(torch.tensor([[0.5, -70.0]])), torch.tensor([[0.5, -5.0]]))
     assert norm.finite
     norm.update(torch.tensor([[math.nan, 0.0]]))

@@ -31,8 +31,8 @@ REINFORCE = """
     class Reinforce:
         '''Policy gradient with a linear policy, a fixed standard deviation and the mean return as baseline.'''
 
-        def __init__(self, sizes, config, device, team):
-            self.config, self.sizes, self.team = config, sizes, team
+        def __init__(self, sizes, config, device, group):
+            self.config, self.sizes, self.group = config, sizes, group
             self.agent = nn.Linear(sizes.policy, sizes.actions).to(device)
             nn.init.zeros_(self.agent.weight)
             self.std = config.params.get("std", 0.3)
@@ -72,7 +72,7 @@ REINFORCE = """
             loss = (miss * advantage / (advantage.std() + 1e-8)).mean()
             self.optimiser.zero_grad()
             loss.backward()
-            self.team.mean_([parameter.grad for parameter in self.agent.parameters()])
+            self.group.all_reduce_mean_([parameter.grad for parameter in self.agent.parameters()])
             self.optimiser.step()
             return {"policy_loss": loss.item()}
 

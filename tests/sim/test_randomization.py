@@ -13,7 +13,7 @@ from torch import Tensor
 from pace.config.sim import BallConfig
 from pace.config.training import TrainConfig, load_train_config
 from pace.sim.ball.ball import ball_preset
-from pace.sim.randomization import BALL_DRAWS, BALL_LIMITS
+from pace.sim.randomization import BALL_LIMITS, SAMPLED_BALL_PARAMS
 from pace.sim.worlds import Worlds
 from pace.studies.ball_trials import PRESETS
 
@@ -31,7 +31,7 @@ def wide_config() -> TrainConfig:
 def drawn_range(name: str) -> tuple[float, float]:
     """Lowest and highest value of a ball parameter under ``randomization=wide``."""
     config = wide_config()
-    range_name, scales = BALL_DRAWS[name]
+    range_name, scales = SAMPLED_BALL_PARAMS[name]
     nominal, (low, high) = getattr(config.ball, name), getattr(config.randomization, range_name)
     ends = np.array([low, high]) * nominal if scales else np.array([low, high]) + nominal
     low, high = ends.clip(*BALL_LIMITS.get(name, (0.0, np.inf)))
@@ -114,7 +114,7 @@ def assert_only_world_1_changed(before: Tensor, after: Tensor, least: float) -> 
     assert (after[1] - before[1]).abs().max() > least
 
 
-@pytest.mark.parametrize("name", BALL_DRAWS)
+@pytest.mark.parametrize("name", SAMPLED_BALL_PARAMS)
 def test_a_ball_parameter_changes_its_world_alone(worlds: Worlds, name: str) -> None:
     def change() -> None:
         value = getattr(worlds.ball.params, name)

@@ -48,7 +48,7 @@ def test_randomised_parameters_stay_in_range_and_change_only_masked_worlds() -> 
     worlds = Worlds(config, 64, "cpu")
     before = {name: value.clone() for name, value in worlds.randomizer.state_dict().items()}
     mask = torch.arange(64) % 2 == 0
-    worlds.randomizer.draw(mask)
+    worlds.randomizer.sample(mask)
     nominal = config.ball.paddle_restitution
     low, high = (nominal + x for x in config.randomization.paddle_restitution)
     after = worlds.randomizer.state_dict()

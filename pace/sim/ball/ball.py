@@ -24,10 +24,10 @@ from pace.sim.ball.state import BallEvents, BallState, Forecast
 
 __all__ = ["FORECAST_HORIZON", "BallEvents", "BallParams", "BallSim", "Forecast", "ball_preset"]
 
-#: Preset that is used where none is named.
+#: Preset that is used if none is named.
 DEFAULT_PRESET = "rubber"
 
-#: m; the ball's radius rounds the net's edge, so the cloth's own thickness hardly matters.
+#: m; the ball's radius rounds the net's edge, so the thickness of the cloth hardly matters.
 NET_THICKNESS = 0.002
 #: Numbers of one knot of a paddle path: centre, normal, linear and angular velocity.
 PATH_WIDTH = 12
@@ -37,7 +37,7 @@ Value = float | Tensor
 
 @lru_cache
 def ball_preset(name: str) -> BallConfig:
-    """``configs/ball/<name>.yaml``, checked. Errors: :class:`pace.config.ConfigError` for a name that is not there."""
+    """``configs/ball/<name>.yaml``, checked. Errors: :class:`pace.config.ConfigError` for an unknown name."""
     folder = config_dir() / "ball"
     path = folder / f"{name}.yaml"
     if not path.is_file() or name.startswith("_"):
@@ -112,7 +112,7 @@ def _material(restitution: float, friction: float) -> Material:
 
 
 def _scene(table: TableConfig, path_dt: float) -> Scene:
-    """Table, net and floor as the kernels read them; the paddle's path is still to come."""
+    """Table, net and floor in the kernels' form, without the paddle's path."""
     scene = Scene()
     scene.table_centre = wp.vec3(0.0, 0.0, table.height - 0.5 * table.thickness)
     scene.table_half = wp.vec3(0.5 * table.length, 0.5 * table.width, 0.5 * table.thickness)
@@ -129,7 +129,8 @@ def _scene(table: TableConfig, path_dt: float) -> Scene:
 class BallSim(BallState):
     """The ball of N worlds. ``fly`` moves it through one control step, ``forecast`` looks ahead.
 
-    All tensors are float32 on ``device``, share memory with Warp and are the same objects for ever: edit them in place.
+    All tensors are float32 on ``device`` and share memory with Warp. They are allocated once and updated in place; edit
+    them in place too.
 
     Attributes:
         position, velocity, spin: (N, 3) m, m/s, rad/s: the ball.
@@ -143,7 +144,7 @@ class BallSim(BallState):
         device: torch device of all tensors.
         params: ball, air and contacts, one for all worlds or one a world.
         table: table, net, floor and the paddle's size.
-        control_dt: s, what one ``fly`` covers.
+        control_dt: s, duration of one ``fly``.
         substeps: S, intervals between the knots of a paddle path.
         ball_dt: s, longest sub-step of a flight.
     """
@@ -171,7 +172,7 @@ class BallSim(BallState):
         self.forecast_result = allocate(Forecast, num_worlds, device)
         self._path_shape = (num_worlds, substeps + 1, PATH_WIDTH)
         self._scene = _scene(table, control_dt / substeps)
-        self._flown = {"params": matrix, "scene": self._scene, "ball_dt": ball_dt}  # what every flight needs to know
+        self._flown = {"params": matrix, "scene": self._scene, "ball_dt": ball_dt}  # arguments of every flight
         self._ask = allocate(BallState, num_worlds, device)
         self._ahead: dict[float, MaskedLaunch] = {}  # by intercept_x, from _ask
         self._fly = Bound(self._record_flight, paddle_path=None)
@@ -190,19 +191,19 @@ class BallSim(BallState):
         """Fly one control step along ``paddle_path`` (N, S + 1, 12), world frame, S + 1 equidistant instants:
         centre (m), unit normal of a face, velocity of the centre (m/s), angular velocity (rad/s).
 
-        Between the instants centre and normal follow cubics through their own values (the velocities are used only
-        where S = 1), and the angular velocity is interpolated linearly.
-        Give the same tensor each time: another one is bound anew, which takes longer.
+        Between the instants centre and normal follow cubics through their values (the velocities are used only if
+        S = 1), and the angular velocity is interpolated linearly.
+        Give the same tensor each time: another one is bound again, which takes longer.
 
         Errors: ``ValueError`` for another shape, type or memory layout.
         """
         self._fly(paddle_path)()
 
     def forecast(self, mask: Tensor, position: Tensor, velocity: Tensor, spin: Tensor, intercept_x: float) -> None:
-        """Look ahead from position, velocity and spin (N, 3) in the worlds of ``mask`` (N,) bool.
+        """Simulate ahead from position, velocity and spin (N, 3) in the worlds of ``mask`` (N,) bool.
 
-        Fills their rows of ``forecast_result`` and leaves the others; ``intercept_x`` is in m. The flight passes
-        through paddles; net, table and floor are met.
+        Fills their rows of ``forecast_result`` and leaves the others; ``intercept_x`` is in m. The flight collides with
+        net, table and floor, but not with paddles.
         """
         for own, given in zip(vars(self._ask).values(), (position, velocity, spin), strict=True):
             own.copy_(given)
@@ -211,13 +212,13 @@ class BallSim(BallState):
         self._ahead[intercept_x](mask)
 
     def forecaster(self, ball: BallState, intercept_x: float) -> MaskedLaunch:
-        """:meth:`forecast` of a mask, always from these tensors: it reads them where they lie, which saves copies."""
+        """:meth:`forecast` of a mask, always from these tensors: it reads them in place, which saves copies."""
         given = {"forecast": self.forecast_result, "intercept_x": intercept_x} | self._flown
         return MaskedLaunch(forecast_flight, self.num_worlds, self.device, ball=ball, **given)
 
     def skipper(self, duration: Tensor) -> MaskedLaunch:
-        """A function of a mask (N,) bool that moves those balls on by ``duration`` (N,) s of their flight at once.
+        """A function of a mask (N,) bool that moves those balls forward by ``duration`` (N,) s of their flight at once.
 
-        No further than to where they are about to touch something; nothing is hit and nothing is noted.
+        The flight ends just before the first contact; no event is recorded.
         """
         return MaskedLaunch(skip_flight, self.num_worlds, self.device, ball=self, duration=duration, **self._flown)

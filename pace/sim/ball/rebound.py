@@ -1,8 +1,8 @@
-"""Shapes that a ball can meet and its rebound from them, as Warp functions.
+"""Shapes that a ball can hit and its rebound from them, as Warp functions.
 
-Shapes give the signed distance of a point and the outward unit normal there, so that edges and rims are rounded as a
-sphere meets them. The rebound is an impulse with Coulomb friction on a hollow sphere (inertia 2/3 m r^2; Nakashima
-et al. 2010): the contact either slides or stops slipping (rolling).
+Shapes give the signed distance of a point and the outward unit normal there, so edges and rims are rounded by the
+ball's radius. The rebound is an impulse with Coulomb friction on a hollow sphere (inertia 2/3 m r^2; Nakashima et al.
+2010): the contact either slides or stops slipping (rolling).
 """
 
 import warp as wp
@@ -70,7 +70,7 @@ def slip_velocity(velocity: wp.vec3, spin: wp.vec3, normal: wp.vec3, radius: flo
 
 @wp.func
 def rebound(velocity: wp.vec3, spin: wp.vec3, normal: wp.vec3, surface: wp.vec3, radius: float, material: Material):
-    """Velocity and spin of a ball after an impulse; unchanged when it does not approach the surface.
+    """Velocity and spin of a ball after an impulse; unchanged if it does not approach the surface.
 
     ``normal`` is a unit vector from the surface to the ball; ``surface`` is the velocity (m/s) of the surface's point
     at the contact. The surface is taken as infinitely heavy.

@@ -1,4 +1,4 @@
-"""A ball, what it met in a control step, and what it will meet: N worlds' tensors, and the kernels' structs of them."""
+"""State, events and forecast of the ball: tensors of N worlds, and the kernels' structs of them."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ class BallState:
 
 @struct_of(BallState)
 class BallArrays:
-    """:class:`BallState` as kernels see it."""
+    """:class:`BallState` in the kernels' form."""
 
 
 @dataclass(frozen=True)
 class BallEvents:
-    """What the ball met in the last control step; every flight overwrites all of it.
+    """Contacts of the ball in the last control step; every flight overwrites all of them.
 
-    Counts are of contacts that begin; rolling or resting on counts once. The rims of the table's top belong to the top
-    (ITTF 2.1.5); its sides and underside count as ``edge``. Times are s into the control step, of the first contact of
-    that kind, infinite if there is none. The ``hit`` values belong to the first paddle hit and are zero without one.
+    Counts are of contacts that begin; a rolling or resting ball counts once. The rims of the table's top belong to the
+    top (ITTF 2.1.5); its sides and underside count as ``edge``. Times are s into the control step, of the first contact
+    of that kind, infinite if there is none. The ``hit`` values belong to the first paddle hit and are zero without one.
     """
 
     own_bounce: Int
@@ -42,7 +42,7 @@ class BallEvents:
     net_time: InfFloat  # s
     floor_time: InfFloat  # s
     edge_time: InfFloat  # s
-    hit_point: Vec3  # m, where ball and paddle touched
+    hit_point: Vec3  # m, contact point of ball and paddle
     hit_position: Vec3  # m, ball's centre
     hit_offset: Vec3  # m, ball's centre minus paddle's centre
     hit_normal: Vec3  # unit vector from the paddle to the ball
@@ -52,22 +52,22 @@ class BallEvents:
     hit_spin_out: Vec3  # rad/s
     hit_rim: Bool  # the rim or its edge rather than a face
     paddle_impulse: Vec3  # N s on the paddle, sum over the step
-    impulse_point: Vec3  # m, where the last of it acted
+    impulse_point: Vec3  # m, contact point of the last impulse
     bounce_position: Vec3  # m, ball's centre at the step's first bounce on the table's top
 
 
 @struct_of(BallEvents)
 class EventArrays:
-    """:class:`BallEvents` as kernels see it."""
+    """:class:`BallEvents` in the kernels' form."""
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """A flight ahead without a paddle: tensors (N, ...), float32, s and m from now on, NaN where there is none.
+    """A flight ahead without a paddle: tensors (N, ...), float32, s and m from now on, NaN if an event does not occur.
 
-    ``bounce`` is the first on the own half, ``apex`` where the ball first stops rising after it, and ``intercept`` the
-    later of the apex and the passing of x = intercept_x. ``landing`` is the first contact with the table's top or the
-    floor. Positions are of the ball's centre. The forecast ends on the floor, or after :data:`FORECAST_HORIZON`.
+    ``bounce`` is the first on the own half, ``apex`` the first highest point after it, and ``intercept`` the later of
+    the apex and the passing of x = intercept_x. ``landing`` is the first contact with the table's top or the floor.
+    Positions are of the ball's centre. The forecast ends on the floor, or after :data:`FORECAST_HORIZON`.
     """
 
     bounce: NanVec3  # m
@@ -82,9 +82,9 @@ class Forecast:
     landing_time: NanFloat  # s
     landing_own: Bool  # the landing is on the own half of the table
     landing_opponent: Bool  # the landing is on the opponent's half
-    net_height: NanFloat  # m, z where the ball first passes x = 0 towards the opponent
+    net_height: NanFloat  # m, z of the ball when it first passes x = 0 towards the opponent
 
 
 @struct_of(Forecast)
 class ForecastArrays:
-    """:class:`Forecast` as kernels see it."""
+    """:class:`Forecast` in the kernels' form."""

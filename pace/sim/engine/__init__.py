@@ -1,5 +1,5 @@
 """The robot's physics: one protocol, and the engines behind it.
 
-Here belongs what steps joints and bodies; not the ball, which is a kernel of its own (``sim.ball``). Imports
+Stepping joints and bodies belongs here; the ball, which has a separate kernel (``sim.ball``), does not. Imports
 ``sim.robot``, ``arrays`` and the rooms below; ``sim.worlds`` imports it.
 """

@@ -1,4 +1,4 @@
-"""RobotEngine: the one contract that both physics engines meet, and the factory that chooses between them."""
+"""RobotEngine: the protocol of the physics engines, and their common base."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ Unit = Annotated[Float, Start(1.0)]
 
 @dataclass(frozen=True)
 class EngineParams:
-    """Physical parameters of each world, float32, edited in place and put to work by ``apply_params``.
+    """Physical parameters of each world, float32, edited in place and put into effect by ``apply_params``.
 
-    Contact softness (``invweight0``) stays that of the nominal robot.
+    Contact softness (``invweight0``) remains that of the nominal robot.
     """
 
     friction: Float  # sliding friction of every contact
@@ -33,26 +33,26 @@ class EngineParams:
     kp_scale: Unit  # of all joints
     kd_scale: Unit
     armature_scale: Unit
-    effort_scale: Unit  # of the effort and, where the motors know their speed, of the stall torque
+    effort_scale: Unit  # of the effort and, if the motors have a torque-speed line, of the stall torque
 
     @classmethod
     def nominal(cls, model: mujoco.MjModel, num_worlds: int, device: torch.device) -> EngineParams:
-        """The parameters with which every world is ``model`` itself."""
+        """The parameters with which every world equals ``model``."""
         params = allocate(cls, num_worlds, device)
         params.friction.fill_(float(model.pair_friction[0, 0]))
         return params
 
 
 class RobotEngine(Protocol):
-    """N worlds with one robot each. Tensors are float32 on ``device`` and the same objects for ever.
+    """N worlds with one robot each. Tensors are float32 on ``device``, allocated once and updated in place.
 
     Attributes:
         qpos_path, qvel_path: (N, S + 1, 7 + J) and (N, S + 1, 6 + J): the states at the S + 1 physics instants of the
             last control step, 0 its start and S its end. MuJoCo's conventions: quaternion w, x, y, z; linear velocity
             of the base in the world frame, its angular velocity in the body frame.
         foot_force: (N, 2, 3) N, world frame: net contact force on the left and right foot in the last physics step.
-        body_contact: (N, B): 1 where that body of ``RobotSpec.contacts`` touched anything in the last physics step.
-        joint_torque: (N, J) N m: what the motors gave in the last physics step.
+        body_contact: (N, B): 1 if that body of ``RobotSpec.contacts`` touched anything in the last physics step.
+        joint_torque: (N, J) N m: of the motors in the last physics step.
         params: physical parameters of each world.
     """
 
@@ -68,7 +68,7 @@ class RobotEngine(Protocol):
     joint_torque: Tensor
 
     def advance(self, targets: Tensor, applied: Tensor) -> None:
-        """Play one control step.
+        """Simulate one control step.
 
         Args: targets (N, S, J) rad: joint targets of each physics step; applied (N, 6 + J): generalized force (N, N m)
         held over the control step.
@@ -78,7 +78,7 @@ class RobotEngine(Protocol):
     def reset(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
         """Put the worlds of ``mask`` (N,) bool into the state qpos (N, 7 + J), qvel (N, 6 + J).
 
-        Their whole path holds that state, their forces and contacts are zero, and the solver forgets its warm start.
+        Their whole path holds that state, their forces and contacts are zero, and the solver's warm start is cleared.
         """
         ...
 
@@ -91,11 +91,11 @@ class RobotEngine(Protocol):
         ...
 
     def overflowed(self) -> bool:
-        """Whether a world ever had more contacts or constraints than there is room for. Waits for the device."""
+        """Whether a world ever had more contacts or constraints than the memory holds. Waits for the device."""
         ...
 
     def state_tensors(self) -> dict[str, Tensor]:
-        """All that the next control step depends on, besides ``params``: the tensors themselves."""
+        """All tensors that the next control step depends on, besides ``params``."""
         ...
 
     def state_dict(self) -> dict[str, Tensor]:
@@ -103,13 +103,13 @@ class RobotEngine(Protocol):
         ...
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Put back what :meth:`state_dict` returned."""
+        """Load the result of :meth:`state_dict`."""
         ...
 
 
 @dataclass(eq=False)
 class EngineState:
-    """What every engine shows: see :class:`RobotEngine`."""
+    """The public tensors of an engine: see :class:`RobotEngine`."""
 
     qpos_path: Annotated[Float, "instants", "nq"]
     qvel_path: Annotated[Float, "instants", "nv"]
@@ -120,11 +120,11 @@ class EngineState:
 
 @struct_of(EngineState)
 class EngineArrays:
-    """:class:`EngineState` as kernels see it."""
+    """:class:`EngineState` in the kernels' form."""
 
 
 class StateTensors(EngineState, Stateful):
-    """The tensors that every engine shows, and their part in reset and resume."""
+    """The public tensors of an engine, and their part in reset and resume."""
 
     def __init__(
         self, model: mujoco.MjModel, num_worlds: int, device: torch.device, substeps: int, physics_dt: float
@@ -143,11 +143,11 @@ class StateTensors(EngineState, Stateful):
         self._reset = Bound(self._record_reset, **starts)
 
     def _solver_state(self) -> dict[str, Tensor]:
-        """qpos (N, 7 + J), qvel and warmstart (N, 6 + J) of the engine itself, in its precision."""
+        """qpos (N, 7 + J), qvel and warmstart (N, 6 + J) of the engine, in its precision."""
         raise NotImplementedError
 
     def reset(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
-        """See :class:`RobotEngine`. Give the same tensors each time: others are bound anew, which takes longer."""
+        """See :class:`RobotEngine`. Give the same tensors each time: others are bound again, which takes longer."""
         self._reset(qpos, qvel)(mask)
 
     def _record_reset(self, qpos: Tensor, qvel: Tensor) -> MaskedLaunch:

@@ -57,7 +57,7 @@ def make_engine(
 ) -> RobotEngine:
     """N worlds of ``model`` on ``device``. Engine ``auto`` is mjwarp on a GPU and native on the CPU.
 
-    Args: substeps: physics steps of one control step. The worlds stand in the model's nominal keyframe.
+    Args: substeps: physics steps of one control step. The worlds start in the model's nominal keyframe.
     Errors: :class:`ConfigError` for an unknown engine, a device that is not there, or that the engine or CUDA graphs
     cannot use.
     """

@@ -61,9 +61,9 @@ class MjwarpEngine(StateTensors):
         super().__init__(model, num_worlds, device, substeps, engine.physics_dt)
         with warp_scope(device):
             self.model = mjw.put_model(model, batch_sizes=dict.fromkeys(ModelFields.NAMES, num_worlds))
-            self.model.opt.warn_overflow = 0  # a line a world a step; overflowed() tells
+            self.model.opt.warn_overflow = 0  # would print a line per world and step; overflowed() reports it instead
             # On a GPU all iterations are launched, and converged worlds skip theirs: a loop that ends on the device
-            # would interrupt the capture around it, after which torch no longer knows what memory is the graph's.
+            # would interrupt the capture around it, and torch would lose track of the graph's memory.
             self.model.opt.graph_conditional = device.type == "cpu"
             self.data = mjw.make_data(
                 model, num_worlds, nconmax=engine.contacts_per_world, njmax=engine.constraints_per_world

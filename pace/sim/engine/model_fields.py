@@ -16,7 +16,7 @@ from pace.sim.engine.base import EngineParams
 
 @wp.struct
 class Write:
-    """One number of a world's model: ``base + gain * param``, or ``base + gain / param`` where ``inverse`` is 1."""
+    """One number of a world's model: ``base + gain * param``, or ``base + gain / param`` if ``inverse`` is 1."""
 
     param: wp.array[wp.float32]
     float32: wp.array2d[wp.float32]  # the field (N, size), in the engine's precision; the other one is empty
@@ -49,7 +49,7 @@ PRECISIONS = (torch.float32, torch.float64)
 
 
 class Change(NamedTuple):
-    """A part of a field, and what it must hold."""
+    """A part of a field, and its new value."""
 
     field: str
     where: tuple[int | slice, ...]  # in one world's array
@@ -90,7 +90,7 @@ class ModelFields:
 
 
 def _body(model: mujoco.MjModel, params: EngineParams) -> Iterator[Change]:
-    """Friction, and the trunk with what is bolted to it; its inertia grows in proportion to its mass."""
+    """Friction, and the trunk with the bodies fixed to it; its inertia grows in proportion to its mass."""
     trunk = int(model.jnt_bodyid[0])  # the free joint's
     mass, inertia = model.body_mass[trunk], model.body_inertia[trunk]
     yield Change("pair_friction", (slice(None), slice(2)), params.friction, 0.0, 1.0)  # both directions
@@ -102,7 +102,7 @@ def _body(model: mujoco.MjModel, params: EngineParams) -> Iterator[Change]:
 
 
 def _motors(model: mujoco.MjModel, params: EngineParams) -> Iterator[Change]:
-    """What set_to_dcmotor and set_to_position of :mod:`pace.sim.robot` write."""
+    """The fields that set_to_dcmotor and set_to_position of :mod:`pace.sim.robot` write."""
     every, gains = slice(None), model.actuator_gainprm
     if bool((model.actuator_gaintype == mujoco.mjtGain.mjGAIN_DCMOTOR).all()):
         resistance, kp, kd = gains[:, 0], gains[:, 4], gains[:, 6]

@@ -25,7 +25,7 @@ _CONTROL = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_QFRC_
 class NativeEngine(StateTensors):
     """MuJoCo C in float64. ``mujoco.batch`` keeps a pool of threads, the warm start and each world's model fields.
 
-    See :class:`~pace.sim.engine.base.RobotEngine`. Work on the host in proportion to the worlds concerned is allowed
+    See :class:`~pace.sim.engine.base.RobotEngine`. Host work proportional to the number of masked worlds is allowed
     here.
     """
 
@@ -37,7 +37,7 @@ class NativeEngine(StateTensors):
         super().__init__(model, num_worlds, device, substeps, engine.physics_dt)
         stop_timers()
         model = copy.copy(model)
-        # a state that is not finite stays so and is seen; MuJoCo would put that robot back on its feet without a word
+        # a state that is not finite stays so and is detected; MuJoCo would reset that robot silently
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         self._batch = batch = Batch(model, num_worlds, engine.threads or usable_cores())
         fields = {name: torch.from_numpy(batch.expand(name)) for name in ModelFields.NAMES}
@@ -50,7 +50,7 @@ class NativeEngine(StateTensors):
         self._record = {name: np.zeros((num_worlds, substeps, width)) for name, width in widths.items()}
         self._sensordata = torch.from_numpy(self._record["sensordata"])[:, -1]
         self._actuator_force = torch.from_numpy(self._record["actuator_force"])[:, -1]
-        # NumPy copies: torch's would wake its own threads beside the pool's, which costs milliseconds on busy cores
+        # NumPy copies: torch's would wake torch's threads beside the pool's, which costs milliseconds on busy cores
         self._paths = {"qpos": self.qpos_path.numpy(), "qvel": self.qvel_path.numpy()}
         self._qpos[:] = self._paths["qpos"][:, 0]
 
@@ -80,10 +80,10 @@ class NativeEngine(StateTensors):
 
 
 def stop_timers() -> None:
-    """Let MuJoCo read no clock in this process: its Python module times every part of every step, 5 % of it.
+    """Stop MuJoCo's timing in this process: its Python module times every part of every step, which costs 5 %.
 
-    ``MjData.timer`` stays zero from then on. A module that does not show its hook keeps its clock.
+    ``MjData.timer`` stays zero from then on. A module without an accessible hook keeps its clock.
     """
-    # mujoco.set_mjcb_time(None) only puts the module's own clock back
+    # mujoco.set_mjcb_time(None) only restores the module's default clock
     with suppress(ValueError):
         ctypes.c_void_p.in_dll(ctypes.CDLL(_batch.__file__), "mjcb_time").value = None
