@@ -287,6 +287,7 @@ def children_of(pid: int) -> list[int]:
     return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
+@pytest.mark.slow
 def test_two_processes_train_and_resume_exactly_and_one_resumes_from_them(tmp_path: Path) -> None:
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     status, out, err = finish(start(f"out={whole}", f"samples={3 * UPDATE}", *SMALL))
@@ -315,6 +316,7 @@ def test_two_processes_train_and_resume_exactly_and_one_resumes_from_them(tmp_pa
     assert len(alone.training["processes"]) == 1  # type: ignore[index]
 
 
+@pytest.mark.slow
 def test_the_jobs_of_a_sweep_have_separate_workers(tmp_path: Path) -> None:
     """Hydra's ``-m`` runs the command once for each value; a worker simulates the task of its rank 0's job."""
     folder = f"out={tmp_path}/${{seed}}_${{sensing.name}}"
@@ -331,6 +333,7 @@ def test_the_jobs_of_a_sweep_have_separate_workers(tmp_path: Path) -> None:
     assert min(delays[1]) > 0.5  # control steps
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="looks for child processes in /proc")
 def test_ctrl_c_saves_and_a_lost_process_is_told(tmp_path: Path) -> None:
     process = start(f"out={tmp_path / 'stopped'}", "minutes=10", *SMALL)

@@ -32,6 +32,7 @@ def test_all_notebooks_are_tested() -> None:
     assert {path.name for path in (ROOT / "notebooks").glob("*.ipynb")} == set(NOTEBOOKS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NOTEBOOKS)
 def test_a_notebook_runs(name: str) -> None:
     figures, sentences = NOTEBOOKS[name]

@@ -105,6 +105,7 @@ def play(env: TableTennisEnv, steps: int = STEPS) -> list[dict[str, Any]]:
     return states
 
 
+@pytest.mark.slow
 def test_replayed_steps_and_resets_equal_those_without_a_graph(emulated: list[Recording]) -> None:
     """Bit for bit, though a replay has nothing but the operators, numbers and addresses of the second call."""
     plain, graphed = make(), make()

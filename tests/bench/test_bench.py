@@ -49,6 +49,7 @@ def bench_config(*overrides: str) -> BenchConfig:
     return parse(compose("bench", [*TINY, *overrides]), BenchConfig)
 
 
+@pytest.mark.slow
 def test_whole_quick_run_writes_every_key(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     path = tmp_path / "bench.json"
@@ -67,6 +68,7 @@ def test_whole_quick_run_writes_every_key(tmp_path: Path, monkeypatch: pytest.Mo
     assert 100.0 < written["peak_memory_mib"] < 3 * 1024
 
 
+@pytest.mark.slow
 def test_parts_that_were_not_asked_for_are_null(tmp_path: Path) -> None:
     path = tmp_path / "run" / "bench.json"
     measure(bench_config("bench.parts=[physics]"), [], path)
@@ -89,6 +91,7 @@ def test_native_rates_are_of_n_and_of_twice_as_many_worlds(monkeypatch: pytest.M
     assert physics.native_rates(bench_config()) == {"raw_mujoco_steps_per_s": 4.0, "raw_mujoco_2x_steps_per_s": 8.0}
 
 
+@pytest.mark.slow
 def test_a_crew_plays_its_share_in_each_process_and_tells_of_one_that_failed() -> None:
     with EnvironmentProcesses(bench_config(), "native", 2) as processes:
         processes.run()
@@ -178,6 +181,7 @@ def test_matrix_products_are_those_of_one_pass(monkeypatch: pytest.MonkeyPatch) 
     assert sum(operations) == 2 * 8 * algo.steps * (3 * weights - first)
 
 
+@pytest.mark.slow
 def test_training_run_that_fails_says_why() -> None:
     with pytest.raises(training.BenchError, match="no_such_device"):
         training.training_run(4, 1, ["device=no_such_device"])

@@ -190,6 +190,7 @@ class Watched:
         return self.session.run(names, inputs)
 
 
+@pytest.mark.slow
 def test_a_policy_that_remembers_its_returns(remembering: tuple[Path, TaskPolicy, dict[str, float]]) -> None:
     file, policy, differences = remembering
     assert max(differences.values()) < 1e-4
@@ -207,6 +208,7 @@ def test_a_policy_that_remembers_its_returns(remembering: tuple[Path, TaskPolicy
     assert meta["state"]["delay.delay"]["unit"] == "s"
 
 
+@pytest.mark.slow
 def test_the_filter_of_the_whole_flight_is_exported_for_any_number_of_robots(tmp_path: Path) -> None:
     pytest.importorskip("onnxscript")
     policy = fresh_policy(["observation=memory", "predictor=filter"])

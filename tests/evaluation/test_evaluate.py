@@ -187,6 +187,7 @@ def run_main(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     return main()
 
 
+@pytest.mark.slow
 def test_the_command_writes_what_it_says(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -286,6 +287,7 @@ def fake_row(serves: int) -> SimpleNamespace:
     return SimpleNamespace(summary=summarise("short", records([Outcome.SUCCESS] * serves), (1.15, 0.0), 0.9))
 
 
+@pytest.mark.slow
 def test_an_interrupted_sweep_keeps_its_cells_and_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -66,6 +66,7 @@ def test_the_learning_rate_falls_and_a_stop_keeps_what_was_learned(
     assert rates == pytest.approx([0.004, 0.00342, 0.00202], rel=0.01)
 
 
+@pytest.mark.slow
 def test_command_trains_and_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     overrides = ["num_worlds=256", "samples=120e3", "minutes=0", "progress=false", "predictor.batches_per_update=40"]
     monkeypatch.setattr(sys, "argv", ["train", f"out={tmp_path}", *overrides])

@@ -70,6 +70,7 @@ def train(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     return main()
 
 
+@pytest.mark.slow
 def test_a_run_changes_its_task_and_resumes_exactly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, updates in (("whole", 4), ("parts", 2)):  # the parts meet where the stage begins
         samples, folder = f"samples={updates * UPDATE}", f"out={tmp_path / name}"

@@ -38,6 +38,7 @@ def real_run(train, path: Path, updates: int, *arguments: str) -> int:
     return train(f"num_worlds={WORLDS}", f"samples={updates * UPDATE}", f"out={path}", *SMALL, *arguments)
 
 
+@pytest.mark.slow
 def test_real_updates_and_an_exact_resume(train, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert real_run(train, tmp_path / "whole", 4) == 0
     printed = capsys.readouterr().out
@@ -66,6 +67,7 @@ def test_init_from_starts_anew_with_the_weights(train, tmp_path: Path) -> None:
     assert 0.0 < change.abs().max().item() < 0.1
 
 
+@pytest.mark.slow
 def test_a_policy_can_go_on_with_another_predictor(train, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     assert real_run(train, tmp_path / "policy", 1) == 0
     assert real_run(train, tmp_path / "filter", 1, "predictor=filter") == 0

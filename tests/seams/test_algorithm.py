@@ -109,6 +109,7 @@ def folder(tmp_path: Path) -> Iterator[Path]:
         yield tmp_path
 
 
+@pytest.mark.slow
 def test_reinforce_trains_resumes_exactly_and_is_evaluated_and_exported(folder: Path) -> None:
     chosen = ["algo.algorithm=outside_reinforce:Reinforce", "+algo.params.std=0.2"]
     arguments = [argument for argument in SMALL if not argument.startswith("samples")]

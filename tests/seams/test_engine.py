@@ -82,6 +82,7 @@ def test_its_state_is_saved_and_put_back(folder: Path) -> None:
     assert torch.equal(other.policy_observation, expected)
 
 
+@pytest.mark.slow
 def test_a_policy_is_trained_in_it_and_plays_in_it_or_in_another(folder: Path) -> None:
     run = folder / "run"
     assert command(train, f"out={run}", "engine.name=outside_puppet:Puppet", *SMALL) == 0

@@ -19,6 +19,7 @@ from pace.task.outcome import Outcome
 from tests.helpers.outside import SMALL, command
 
 
+@pytest.mark.slow
 def test_a_policy_trained_without_the_term_is_evaluated(tmp_path: Path) -> None:
     run, out = tmp_path / "run", tmp_path / "table"
     assert command(train, f"out={run}", "~reward.terms.predicted_landing", *SMALL) == 0
@@ -28,6 +29,7 @@ def test_a_policy_trained_without_the_term_is_evaluated(tmp_path: Path) -> None:
     assert (out / "landing_map.png").exists()
 
 
+@pytest.mark.slow
 def test_the_table_measures_from_the_target_of_the_task() -> None:
     policy = load_policy("pretrained/pace")
     assert policy.config.landing_target == list(LANDING_TARGET)

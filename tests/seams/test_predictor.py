@@ -46,6 +46,7 @@ def folder(tmp_path: Path) -> Iterator[Path]:
         yield tmp_path
 
 
+@pytest.mark.slow
 def test_it_trains_alone_and_with_a_policy_and_plays(folder: Path) -> None:
     alone, run = folder / "alone", folder / "run"
     limits = ("num_worlds=256", "samples=100e3", "minutes=0", "progress=false", "predictor.batches_per_update=40")
@@ -62,6 +63,7 @@ def test_it_trains_alone_and_with_a_policy_and_plays(folder: Path) -> None:
     torch.testing.assert_close(env.actor.prediction, policy.predictor(env.predictor_input))
 
 
+@pytest.mark.slow
 def test_it_learned_with_the_priors_of_its_serves_and_keeps_them(folder: Path) -> None:
     slow, next_run = folder / "slow", folder / "next"
     limits = ("num_worlds=64", "samples=1", "minutes=0", "progress=false")

@@ -55,6 +55,7 @@ def folder(tmp_path: Path) -> Iterator[Path]:
         yield path
 
 
+@pytest.mark.slow
 def test_a_term_given_by_its_path_trains_and_the_policy_plays_without_it(folder: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     assert command(train, f"out={run}", MINE, *SMALL) == 0
@@ -110,6 +111,7 @@ def test_an_installed_entry_point_needs_no_naming(folder: Path) -> None:
         TERMS["calmer"]
 
 
+@pytest.mark.slow
 def test_observations_from_outside_train_and_need_their_module_again(folder: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     critic = "observation.critic=[apex, outside_sight:true_speed]"
@@ -142,6 +144,7 @@ def test_the_type_says_who_may_see_it(folder: Path, group: str, name: str, words
         make_env(2, "native", "cpu", overrides=[f"observation.{group}=[heading,'{name}']"])
 
 
+@pytest.mark.slow
 def test_several_processes_and_a_resumed_run_know_the_module(folder: Path, tmp_path: Path) -> None:
     """The module lies in the working folder; each process of the run imports it."""
     arguments = [argument for argument in SMALL if not argument.startswith("samples")]

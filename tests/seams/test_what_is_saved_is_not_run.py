@@ -44,6 +44,7 @@ def planted(folder: Path, change: Callable[[dict[str, Any]], None]) -> Path:
     return run
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", PATHS)
 def test_a_reward_is_not_even_looked_for(folder: Path, path: str) -> None:
     def change(config: dict[str, Any]) -> None:
