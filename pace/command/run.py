@@ -6,9 +6,11 @@ import os
 import re
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from pkgutil import resolve_name
 
 import hydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -17,7 +19,7 @@ from pace.command.arguments import plain_overrides, prepare
 from pace.command.help import command_help
 from pace.command.table import COMMANDS, Command
 from pace.config import plugins
-from pace.config.base import ConfigError, compose, config_dir, meant
+from pace.config.base import ConfigError, also_from, compose, config_dir, meant
 from pace.config.names import check_choice, split_override
 
 EXIT_USAGE = 2
@@ -69,7 +71,8 @@ def _run_hydra(command: Command) -> int:
         try:
             if "plugins" in config:
                 plugins.use_named(config)
-            work(config)
+            with also_from(_given_folders()):
+                work(config)
         except ConfigError as error:
             status = complain(str(error), EXIT_USAGE)
         except tuple(failures) as error:
@@ -77,6 +80,13 @@ def _run_hydra(command: Command) -> int:
 
     hydra.main(config_path=str(config_dir()), config_name=command.config, version_base="1.3")(guarded)()
     return status
+
+
+def _given_folders() -> list[Path]:
+    """Folders that the user has named on the command line (``--config-dir``), from which Hydra composed, too."""
+    sources = HydraConfig.get().runtime.config_sources
+    named = [source.path for source in sources if source.schema == "file" and source.provider not in ("main", "schema")]
+    return [Path(path).absolute() for path in named]
 
 
 def explain(name: str, arguments: Sequence[str], error: Exception) -> str:

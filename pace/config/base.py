@@ -7,7 +7,8 @@ here say which keys exist and of what type they are; an unknown key, a wrong typ
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -31,6 +32,31 @@ def config_dir() -> Path:
         if candidate.is_dir():
             return candidate
     raise ConfigError(f"no configs/ folder beside {package}: reinstall pace-table-tennis or run from a checkout")
+
+
+_outside: list[Path] = []  # folders of the user, each with groups of its own
+
+
+def config_dirs() -> list[Path]:
+    """:func:`config_dir`, and the folders of :func:`also_from`."""
+    return [config_dir(), *_outside]
+
+
+@contextmanager
+def also_from(folders: Sequence[Path]) -> Iterator[None]:
+    """Choices of ``folders`` are known, too, in the block: those of a command's ``--config-dir``."""
+    before = list(_outside)
+    _outside.extend(folders)
+    try:
+        yield
+    finally:
+        _outside[:] = before
+
+
+def search_override() -> list[str]:
+    """The folders of :func:`also_from` as an override of Hydra, for another command; none: an empty list."""
+    quoted = [str(folder).replace("\\", "\\\\").replace("'", "\\'") for folder in _outside]
+    return ["hydra.searchpath=[" + ",".join(f"'file://{folder}'" for folder in quoted) + "]"] if quoted else []
 
 
 def require(condition: bool, message: str) -> None:
@@ -74,7 +100,10 @@ def meant(word: str, known: Iterable[str]) -> str:
 
 
 def compose(config_name: str, overrides: list[str] | None = None) -> DictConfig:
-    """Compose ``configs/<config_name>.yaml`` with Hydra overrides, for tests, notebooks and rebuilt runs."""
+    """Compose ``configs/<config_name>.yaml`` with Hydra overrides, for tests, notebooks and rebuilt runs.
+
+    Choices may also lie in the folders of :func:`also_from`.
+    """
     from hydra import compose as hydra_compose
     from hydra import initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
@@ -83,7 +112,7 @@ def compose(config_name: str, overrides: list[str] | None = None) -> DictConfig:
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(config_dir=str(config_dir()), version_base="1.3"):
-            return hydra_compose(config_name=config_name, overrides=overrides or [])
+            return hydra_compose(config_name=config_name, overrides=[*search_override(), *(overrides or [])])
     finally:
         GlobalHydra.instance().hydra = outer
 

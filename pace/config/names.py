@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from pace.config.base import ConfigError, config_dir, meant
+from pace.config.base import ConfigError, config_dirs, meant
 from pace.config.renamed import renamed_choice
 
 #: Old key -> new key, for every command.
@@ -13,8 +13,10 @@ RENAMED_KEYS = {"run_dir": "out"}
 
 def choices(group: str) -> list[str]:
     """Choices of ``group``: the files below configs/<group>, but for parts of others, which begin with ``_``."""
-    folder = config_dir() / group
-    found = [file.relative_to(folder).with_suffix("").as_posix() for file in folder.rglob("*.yaml")]
+    folders = [folder / group for folder in config_dirs()]
+    found = {
+        file.relative_to(folder).with_suffix("").as_posix() for folder in folders for file in folder.rglob("*.yaml")
+    }
     return sorted(
         (name for name in found if not name.split("/")[-1].startswith("_")), key=lambda name: (name.count("/"), name)
     )
@@ -40,6 +42,6 @@ def check_renamed(overrides: Iterable[str]) -> None:
 
 def check_choice(group: str, choice: str) -> None:
     """Errors: :class:`ConfigError` that lists the choices of ``group`` when ``choice`` is none of them."""
-    if not (config_dir() / group / f"{choice}.yaml").is_file():
+    if not any((folder / group / f"{choice}.yaml").is_file() for folder in config_dirs()):
         known = choices(group)
         raise ConfigError(f"{group}/{choice} does not exist{meant(choice, known)} ({group}: {', '.join(known)})")

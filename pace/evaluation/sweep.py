@@ -12,8 +12,9 @@ from typing import Any
 
 import torch
 
-from pace.config.base import config_dir, to_dict
+from pace.config.base import to_dict
 from pace.config.commands import EvaluateConfig, VariationConfig
+from pace.config.names import choices
 from pace.config.overrides import override_task
 from pace.config.sim import RandomizationConfig
 from pace.config.training import TrainConfig
@@ -45,8 +46,8 @@ class Variation:
 
 
 def ball_presets() -> list[str]:
-    """Names of configs/ball/."""
-    return sorted(file.stem for file in (config_dir() / "ball").glob("*.yaml") if not file.stem.startswith("_"))
+    """Names of configs/ball/, and those of the user's own folder."""
+    return choices("ball")
 
 
 def variations(task: TrainConfig, chosen: VariationConfig) -> list[Variation]:

@@ -25,8 +25,8 @@ class AttitudeEstimate(Estimate):
     """
 
     def __init__(self, config: AttitudeEstimateConfig, control_dt: float, joints: int) -> None:
-        super().__init__(joints)
-        self.gain, self.control_dt = config.gain, control_dt
+        super().__init__(config, control_dt, joints)
+        self.gain = config.gain
 
     @staticmethod
     def parts(joints: int) -> dict[str, Part]:

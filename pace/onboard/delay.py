@@ -27,9 +27,7 @@ class DelayEstimate(Estimate):
     Args: config: numbers of the estimate; control_dt: s; joints: J.
     """
 
-    def __init__(self, config: DelayEstimateConfig, control_dt: float, joints: int) -> None:
-        super().__init__(joints)
-        self.config, self.control_dt = config, control_dt
+    config: DelayEstimateConfig
 
     @staticmethod
     def parts(joints: int) -> dict[str, Part]:

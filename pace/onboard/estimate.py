@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from itertools import accumulate
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from torch import Tensor, nn
 
@@ -29,11 +29,12 @@ class Estimate(nn.Module):
     The signals are those that its entry in :data:`pace.onboard.estimates.ESTIMATES` names, as keyword arguments. Both
     are pure: they write into no argument, read no value on the host and use operators that ONNX has.
 
-    Attributes: ``columns`` part -> columns of the state; ``size``.
+    Attributes: ``config`` its numbers; ``control_dt`` s; ``columns`` part -> columns of the state; ``size``.
     """
 
-    def __init__(self, joints: int) -> None:
+    def __init__(self, config: Any, control_dt: float, joints: int) -> None:
         super().__init__()
+        self.config, self.control_dt = config, control_dt
         self.columns = columns(self.parts(joints))
         self.size = max(where.stop for where in self.columns.values())
 

@@ -25,8 +25,7 @@ class JointEstimate(Estimate):
     """
 
     def __init__(self, config: JointEstimateConfig, control_dt: float, joints: int) -> None:
-        super().__init__(joints)
-        self.control_dt = control_dt
+        super().__init__(config, control_dt, joints)
         (self.near, self.nudge), (self.pull, self.follow) = steady_gain(config, control_dt).tolist()
 
     @staticmethod

@@ -32,8 +32,8 @@ class ReturnMemory(Estimate):
     fall: Tensor
 
     def __init__(self, config: ReturnMemoryConfig, control_dt: float, joints: int) -> None:
-        super().__init__(joints)
-        self.config, self.span = config, 2.0 * control_dt
+        super().__init__(config, control_dt, joints)
+        self.span = 2.0 * control_dt
         # in the two steps before the hit, and after it
         self.register_buffer("fall", torch.tensor([0.0, 0.0, self.span * GRAVITY]), persistent=False)
 

@@ -19,7 +19,7 @@ from typing import IO
 from tqdm import tqdm
 
 from pace.command import quote
-from pace.config.base import ConfigError, parse, to_dict
+from pace.config.base import ConfigError, parse, search_override, to_dict
 from pace.config.training import RESUME_KEYS, TrainConfig, load_train_config
 from pace.runs.checkpoint import list_checkpoints, read_meta
 from pace.runs.interrupt import StopRequest
@@ -65,7 +65,7 @@ class Run:
 
     def arguments(self) -> list[str]:
         """Of ``python -m pace.rl.train``, to begin the run or to resume it."""
-        limits = [f"samples={self.samples}", "minutes=0", "progress=false"]
+        limits = [*search_override(), f"samples={self.samples}", "minutes=0", "progress=false"]
         if list_checkpoints(self.folder):
             modules = [f"plugins=[{','.join(self.plugins)}]"] if self.plugins else []
             return [f"resume={quote(str(self.folder))}", *modules, *limits]

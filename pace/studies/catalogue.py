@@ -1,6 +1,6 @@
 """The studies by name: engines against each other, step sizes, solver settings, paddle reaction, motors, what a
 predictor can know, how a policy stands, whether it finds out its paddle, what it makes of its sensors, what bf16
-rounding does to its learning, and the curves of the recipes that were tried.
+rounding does to its learning, the curves of the recipes that were tried, and the rooms of the package.
 
 They print the tables of the pages in ``docs/results`` and draw their figures.
 """
@@ -18,6 +18,7 @@ from pace.rl.policies import load_predictor
 from pace.runs.run_folder import default_folder
 from pace.studies import (
     adaptation,
+    architecture,
     learning_curves,
     motors,
     parity,
@@ -134,6 +135,10 @@ def study_learning(options: Options) -> None:
     print(f"wrote {learning_curves.draw(curves, options.out / 'learning.png')}")
 
 
+def study_architecture(options: Options) -> None:
+    print(f"wrote {architecture.write(options.out)}")
+
+
 STUDIES = {
     "reaction": study_reaction,
     "parity": study_parity,
@@ -147,6 +152,7 @@ STUDIES = {
     "rounding": study_rounding,
     "recipe": study_recipe,
     "learning": study_learning,
+    "architecture": study_architecture,
 }
 
 

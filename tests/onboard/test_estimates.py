@@ -41,7 +41,7 @@ class MeanBall(Estimate):
     """A running mean of where the ball is."""
 
     def __init__(self, config: MeanConfig, control_dt: float, joints: int) -> None:
-        super().__init__(joints)
+        super().__init__(config, control_dt, joints)
         self.gain = config.gain
 
     @staticmethod
