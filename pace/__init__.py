@@ -6,8 +6,9 @@ A notebook begins with ``pace.make_env`` and ``pace.load_policy``; ``python -m p
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from pace.lazy import on_first_use
 from pace.moved import MovedCommands
 
 if TYPE_CHECKING:
@@ -18,15 +19,4 @@ __version__ = "0.1.0"
 __all__ = ["load_policy", "make_env"]
 sys.meta_path.append(MovedCommands())
 
-
-def __getattr__(name: str) -> Any:
-    """Import on first use, so that ``import pace`` stays light."""
-    if name == "load_policy":
-        from pace.rl.policies import load_policy
-
-        return load_policy
-    if name == "make_env":
-        from pace.task.env import make_env
-
-        return make_env
-    raise AttributeError(f"module 'pace' has no attribute {name!r}")
+__getattr__ = on_first_use(__name__, {"load_policy": "pace.rl.policies", "make_env": "pace.task.env"})

@@ -6,7 +6,9 @@ Forecasts of the ball and the network's regression belong here; the robot's use 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from pace.lazy import on_first_use
 
 if TYPE_CHECKING:
     from pace.predictor.forecast import forecast_flight
@@ -15,19 +17,12 @@ if TYPE_CHECKING:
 
 __all__ = ["BallPredictor", "Forecast", "PredictorNetwork", "forecast_flight"]
 
-
-def __getattr__(name: str) -> Any:
-    """Import on first use, so that the command starts fast."""
-    if name == "forecast_flight":
-        from pace.predictor.forecast import forecast_flight
-
-        return forecast_flight
-    if name in ("BallPredictor", "PredictorNetwork"):
-        from pace.predictor import network
-
-        return getattr(network, name)
-    if name == "Forecast":
-        from pace.sim.ball.ball import Forecast
-
-        return Forecast
-    raise AttributeError(f"module 'pace.predictor' has no attribute {name!r}")
+__getattr__ = on_first_use(
+    __name__,
+    {
+        "BallPredictor": "pace.predictor.network",
+        "Forecast": "pace.sim.ball.ball",
+        "PredictorNetwork": "pace.predictor.network",
+        "forecast_flight": "pace.predictor.forecast",
+    },
+)

@@ -6,9 +6,9 @@ The learner belongs here; the task that it learns (``task``) and its evaluation 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import pace
+from pace.lazy import on_first_use
 
 if TYPE_CHECKING:
     from pace.rl.policies import load_policy
@@ -16,9 +16,5 @@ if TYPE_CHECKING:
 
 __all__ = ["load_policy", "make_env"]
 
-
-def __getattr__(name: str) -> Any:
-    """The names of :mod:`pace` that users found here first."""
-    if name in __all__:
-        return getattr(pace, name)
-    raise AttributeError(f"module 'pace.rl' has no attribute {name!r}")
+# Names of :mod:`pace` that users found here first.
+__getattr__ = on_first_use(__name__, {"load_policy": "pace.rl.policies", "make_env": "pace.task.env"})

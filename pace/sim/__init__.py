@@ -5,9 +5,10 @@ The state of the world and its sensors belong here; the robot's task does not. I
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pace.arrays  # noqa: F401  sets Warp up before the first kernel is defined
+from pace.lazy import on_first_use
 
 if TYPE_CHECKING:
     from pace.sim.engine.factory import make_engine
@@ -15,15 +16,4 @@ if TYPE_CHECKING:
 
 __all__ = ["Worlds", "make_engine"]
 
-
-def __getattr__(name: str) -> Any:
-    """Import on first use: the physics takes a while to load."""
-    if name == "Worlds":
-        from pace.sim.worlds import Worlds
-
-        return Worlds
-    if name == "make_engine":
-        from pace.sim.engine.factory import make_engine
-
-        return make_engine
-    raise AttributeError(f"module 'pace.sim' has no attribute {name!r}")
+__getattr__ = on_first_use(__name__, {"Worlds": "pace.sim.worlds", "make_engine": "pace.sim.engine.factory"})

@@ -5,18 +5,13 @@ The robot's task and its observations belong here; learning does not. Imports ``
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from pace.lazy import on_first_use
 
 if TYPE_CHECKING:
     from pace.task.env import TableTennisEnv
 
 __all__ = ["TableTennisEnv"]
 
-
-def __getattr__(name: str) -> Any:
-    """Import on first use: the simulation takes a while to load."""
-    if name == "TableTennisEnv":
-        from pace.task.env import TableTennisEnv
-
-        return TableTennisEnv
-    raise AttributeError(f"module 'pace.task' has no attribute {name!r}")
+__getattr__ = on_first_use(__name__, {"TableTennisEnv": "pace.task.env"})

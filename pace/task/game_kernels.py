@@ -4,7 +4,8 @@ import warp as wp
 
 from pace.sim.ball.state import BallArrays, EventArrays, ForecastArrays
 from pace.task.game_state import GameArrays
-from pace.task.rules import BAD_SERVE, FALL, MISS, OPEN, SUCCESS, Rules, landed, something_to_hit_now
+from pace.task.outcome import Outcome
+from pace.task.rules import Rules, landed, something_to_hit_now
 
 
 @wp.func
@@ -55,12 +56,12 @@ def _over(game: GameArrays, rules: Rules, world: int, height: float, on_floor: b
 @wp.func
 def _decide(game: GameArrays, world: int, lost: bool, over: bool) -> int:
     """Outcome at the end of a step, in which an open serve may end; a ball in flight is decided by its forecast."""
-    if game.referee.outcome[world] != OPEN or not (lost or over):
+    if game.referee.outcome[world] != Outcome.OPEN or not (lost or over):
         return game.referee.outcome[world]
     if lost:
-        return FALL
+        return Outcome.FALL
     if not game.referee.hit[world]:
-        return MISS
+        return Outcome.MISS
     returns = game.returns
     net_touched = game.referee.net_touched[world]
     return landed(returns.lands_opponent[world], returns.lands_own[world], net_touched, returns.landing[world][0])
@@ -87,7 +88,7 @@ def close(
     over = _over(game, rules, world, ball.position[world][2], events.floor[world] > 0)
     outcome = _decide(game, world, lost, over)
     game.referee.outcome[world] = outcome
-    game.referee.success_now[world] = game.referee.was_open[world] and outcome == SUCCESS
+    game.referee.success_now[world] = game.referee.was_open[world] and outcome == Outcome.SUCCESS
     game.ends.lost[world] = lost
     game.ends.over[world] = over or lost
     game.ends.next_serve[world] = over and not lost
@@ -142,9 +143,9 @@ def start_serve(
     game.target.arriving[world] = wp.vec3(0.0)
     if game.target.playable[world] and not wp.isnan(forecast.intercept_time[world]):
         game.target.arriving[world] = forecast.intercept_velocity[world]
-    outcome = int(BAD_SERVE)
+    outcome = int(Outcome.BAD_SERVE)
     if game.target.playable[world]:
-        outcome = OPEN
+        outcome = Outcome.OPEN
     game.referee.outcome[world] = outcome
     game.clock.time[world] = 0.0
     game.referee.own_bounces[world] = 0

@@ -4,7 +4,8 @@ import warp as wp
 
 from pace.sim.ball.state import BallArrays, EventArrays
 from pace.task.game_state import GameArrays
-from pace.task.rules import DOUBLE_HIT, MISS, OPEN, VOLLEY, landed
+from pace.task.outcome import Outcome
+from pace.task.rules import landed
 
 
 @wp.func
@@ -32,9 +33,9 @@ def _judge_flight(
     if net < wp.inf and net <= first:
         game.referee.net_touched[world] = True
     if first == wp.inf:
-        return OPEN
+        return Outcome.OPEN
     if again == first and opponent > first and own > first:
-        return DOUBLE_HIT
+        return Outcome.DOUBLE_HIT
     return landed(opponent == first, own == first, game.referee.net_touched[world], x)
 
 
@@ -53,7 +54,7 @@ def _note_touch(game: GameArrays, events: EventArrays, hit_now: bool, world: int
 def judge(game: GameArrays, events: EventArrays, ball: BallArrays):
     """The referee: consume the events of one control step in the order of their times."""
     world = wp.tid()
-    was_open = game.referee.outcome[world] == OPEN
+    was_open = game.referee.outcome[world] == Outcome.OPEN
     hit_before = game.referee.hit[world]
     touch = events.paddle_hit_time[world]
     struck = events.paddle_hit[world] > 0
@@ -69,9 +70,9 @@ def judge(game: GameArrays, events: EventArrays, ball: BallArrays):
     outcome = game.referee.outcome[world]
     if was_open and not hit_before:
         if lost:
-            outcome = MISS
+            outcome = Outcome.MISS
         elif struck and before == 0:
-            outcome = VOLLEY
+            outcome = Outcome.VOLLEY
     if was_open and (hit_before or hit_now):
         since = wp.float32(-1.0)
         own_count = events.own_bounce[world]

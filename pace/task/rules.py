@@ -6,17 +6,6 @@ from pace.sim.ball.state import BallArrays
 from pace.task.game_state import GameArrays
 from pace.task.outcome import Outcome
 
-OPEN = wp.constant(int(Outcome.OPEN))
-SUCCESS = wp.constant(int(Outcome.SUCCESS))
-MISS = wp.constant(int(Outcome.MISS))
-NET = wp.constant(int(Outcome.NET))
-OUT = wp.constant(int(Outcome.OUT))
-OWN_SIDE = wp.constant(int(Outcome.OWN_SIDE))
-DOUBLE_HIT = wp.constant(int(Outcome.DOUBLE_HIT))
-VOLLEY = wp.constant(int(Outcome.VOLLEY))
-FALL = wp.constant(int(Outcome.FALL))
-BAD_SERVE = wp.constant(int(Outcome.BAD_SERVE))
-
 
 @wp.struct
 class Rules:
@@ -49,7 +38,7 @@ def nothing_to_hit(position: wp.vec3, velocity: wp.vec3, rules: Rules) -> bool:
 
 @wp.func
 def something_to_hit_now(game: GameArrays, ball: BallArrays, rules: Rules, world: int) -> bool:
-    undecided = game.referee.outcome[world] == OPEN and not game.referee.touched[world]
+    undecided = game.referee.outcome[world] == Outcome.OPEN and not game.referee.touched[world]
     return undecided and not nothing_to_hit(ball.position[world], ball.velocity[world], rules)
 
 
@@ -57,9 +46,9 @@ def something_to_hit_now(game: GameArrays, ball: BallArrays, rules: Rules, world
 def landed(opponent: bool, own: bool, net_touched: bool, x: float) -> int:
     """Outcome of a hit ball by where it lands first; off the table it is out, or caught by the net."""
     if opponent:
-        return SUCCESS
+        return Outcome.SUCCESS
     if net_touched and (own or x < 0.0):
-        return NET
+        return Outcome.NET
     if own:
-        return OWN_SIDE
-    return OUT
+        return Outcome.OWN_SIDE
+    return Outcome.OUT
