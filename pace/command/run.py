@@ -1,4 +1,4 @@
-"""Running a command so that wrong input ends in one line on stderr, not in a traceback."""
+"""Running a command; wrong input gives one line on stderr instead of a traceback."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ EXIT_FAILED = 1
 EXIT_INTERRUPTED = 130
 
 Task = Callable[[DictConfig], None]
-#: What a command does, and the errors of it that are expected.
+#: A command's function and its expected errors.
 Work = tuple[Task, tuple[type[Exception], ...]]
 
 
 def run_command(name: str, load: Callable[[], Work]) -> int:
     """Run the command ``name`` of :data:`COMMANDS` with ``sys.argv``; returns the exit status.
 
-    ``load`` imports and returns the work; it is called when the configuration is composed, for torch takes seconds to
-    load. The work gets that configuration. Modules that the user names, in ``plugins`` or by an import path, are
+    ``load`` imports and returns the work; it is called after the configuration is composed, because torch takes seconds
+    to load. The work gets that configuration. Modules that the user names, in ``plugins`` or by an import path, are
     imported first (:mod:`pace.config.plugins`). Wrong input gives one line and status 2, an expected error one line and
     1.
     """
@@ -51,7 +51,7 @@ def run_command(name: str, load: Callable[[], Work]) -> int:
 
 
 def _topic(arguments: Sequence[str]) -> str:
-    """The group that stands behind ``--help``, if one does; a path there is the RUN of the command."""
+    """The group after ``--help``, if any; a path there is the RUN of the command."""
     index = min(arguments.index(flag) for flag in ("-h", "--help") if flag in arguments)
     return next((argument for argument in arguments[index + 1 :] if re.fullmatch(r"\w+(=[\w/]+)?", argument)), "")
 
@@ -62,7 +62,7 @@ def _run_hydra(command: Command, load: Callable[[], Work]) -> int:
     status = 0
 
     def guarded(config: DictConfig) -> None:
-        nonlocal status  # an error that reached Hydra would be announced a second time
+        nonlocal status  # an error that reached Hydra would be printed a second time
         try:
             task, failures = load()
         except ModuleNotFoundError as error:
@@ -84,7 +84,7 @@ def _run_hydra(command: Command, load: Callable[[], Work]) -> int:
 
 
 def explain(name: str, arguments: Sequence[str], error: Exception) -> str:
-    """A line on what Hydra cannot compose: the key or the choice that was probably meant."""
+    """One line for an error of Hydra's composition, with the key or the choice that was probably meant."""
     command = COMMANDS[name]
     for override in plain_overrides(arguments):
         key, value = split_override(override)
@@ -104,11 +104,11 @@ def explain(name: str, arguments: Sequence[str], error: Exception) -> str:
 
 
 def show(text: str) -> int:
-    """Print ``text``, to a reader that may leave before its end (``| head``); returns the exit status."""
+    """Print ``text``, to a reader that may close the pipe early (``| head``); returns the exit status."""
     try:
         print(text, flush=True)
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains when it ends
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python prints an error at exit
     return 0
 
 
