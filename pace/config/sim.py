@@ -139,8 +139,8 @@ class SensingConfig:
     base_shift: float  # m
     mocap_delay: Range  # s, sampled per world at reset: ball, base position and heading
     noise_scale: Range = field(default_factory=lambda: [1.0, 1.0])  # of all amplitudes, sampled per world at reset
-    # m; the ball counts as returned once it is sensed this much farther away than two control steps earlier; noise alone
-    # stays below the threshold
+    # m; the ball counts as returned once it is sensed this much farther away than two control steps earlier; noise
+    # alone stays below the threshold
     moved: float = 0.03
 
     def __post_init__(self) -> None:
