@@ -1,7 +1,7 @@
 """Play an exported policy in plain MuJoCo: the sim-to-sim test, and the starting point for a real robot.
 
     python -m pace.deploy runs/my_run out=.               # writes policy.onnx
-    python examples/deploy_sim2sim.py policy.onnx         # 50 serves, prints what became of them
+    python examples/deploy_sim2sim.py policy.onnx         # 50 serves, prints their outcomes
 
 Needs onnxruntime, mujoco and numpy, and nothing of PACE but the MJCF in pace/sim/assets. One core is enough.
 
@@ -44,7 +44,7 @@ SERVES = {  # m/s: vx, vy, vz (the paper's evaluation)
     "mixed": ((-6.5, -5.2), (-0.6, 0.2), (1.5, 1.9)),
 }
 
-#: What onnxruntime raises for a file that is none of its own; its errors have no common class.
+#: Errors of onnxruntime for a file that it cannot read; they have no common class.
 UNREADABLE = (ort.NoSuchFile, ort.InvalidProtobuf, ort.InvalidGraph, ort.InvalidArgument, ort.NotImplemented, ort.Fail)
 
 Vector = np.ndarray
@@ -293,7 +293,7 @@ class Robot:
         return round(self.noise * self._random.uniform(delay[0], delay[1]) / PHYSICS_DT)
 
     def reset(self, ball: Vector) -> None:
-        """Stand in the nominal pose at the start; draw the delays anew."""
+        """Stand in the nominal pose at the start; resample the delays."""
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[:7] = (*START, self.meta["config"]["robot"]["base_height"], 1.0, 0.0, 0.0, 0.0)
         self.data.qpos[self._qpos] = self.meta["nominal_pose"]
@@ -327,7 +327,7 @@ class Robot:
         return {"base_position": self.data.qpos[:3].copy(), "heading": heading, "ball_position": ball.copy()}
 
     def sense(self) -> Frame:
-        """The sensors' present readings, by the names of the file's inputs."""
+        """The sensors' current readings, by the names of the file's inputs."""
         rotation = self.data.body("Trunk").xmat.reshape(3, 3)
         truth = {
             "base_angular_velocity": self.data.qvel[3:6],
@@ -384,7 +384,7 @@ class Referee:
 
 
 class Match:
-    """Serve after serve, and what became of each.
+    """Serve after serve, and their outcomes.
 
     Attributes: ``results`` outcome -> count, ``hits``, ``clock`` s played.
     """
@@ -403,7 +403,7 @@ class Match:
         self.robot.new_ball(self.ball.position)
 
     def play(self, serves: int) -> None:
-        """Play so many serves; after a fall the robot starts anew."""
+        """Play so many serves; after a fall the robot is reset."""
         standing = False
         for _ in range(serves):
             self._launch()
@@ -443,7 +443,7 @@ class Match:
         return contacts
 
     def _fly(self, before: Blade, after: Blade) -> list[Contact]:
-        """The ball over one physics step, in shorter steps of its own."""
+        """The ball over one physics step, in shorter sub-steps."""
         steps = round(PHYSICS_DT / BALL_DT)
         knots = [_between(before, after, i / steps) for i in range(steps + 1)]
         return [contact for i in range(steps) for contact in self.ball.step(BALL_DT, knots[i], knots[i + 1])]

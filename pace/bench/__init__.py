@@ -1,5 +1,5 @@
-"""Speed and memory of every part of training, beside the limits that others set.
+"""Speed and memory of every part of training, compared with reference limits.
 
-Here belongs what measures this machine; nothing that training itself needs. Imports ``rl`` and the rooms below.
+Measurements of this machine belong here; code that training needs does not. Imports ``rl`` and the rooms below.
 ``python -m pace.bench`` measures.
 """

@@ -1,6 +1,6 @@
 """A measurement of this machine from its configuration.
 
-All is measured in one run, and what is compared by turns.
+All figures are measured in one run; those to be compared are measured in turn.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from pace.config.commands import BenchConfig
 from pace.devices import resolve_device
 from pace.runs.run_folder import default_folder, versions
 
-BUSY_LOAD = 0.5  # a core; a busier machine is worth a word
+BUSY_LOAD = 0.5  # per core; a higher load gives a warning
 
 
 def bench_from_config(composed: DictConfig) -> None:
-    """Measure as the composed configuration says; print the table, write the JSON, say where."""
+    """Measure as configured; print the table, write the JSON, print its path."""
     config = parse(composed, BenchConfig)
     overrides = [o for o in HydraConfig.get().overrides.task if not o.lstrip("+~").startswith("bench")]
     path = Path(config.out or default_folder(config.name)) / report.FILE
@@ -34,7 +34,7 @@ def bench_from_config(composed: DictConfig) -> None:
 def measure(config: BenchConfig, overrides: list[str], path: Path) -> dict[str, Any]:
     """Run the parts that ``config`` names, print the table and write it to ``path``; returns the figures by name.
 
-    ``overrides`` are those of ``config`` that concern training: the training loop runs as a command of its own.
+    ``overrides`` are those of ``config`` that concern training: the training loop runs as a separate command.
     """
     device = resolve_device(config.device)
     machine = report.machine(device)

@@ -20,10 +20,10 @@ from pace.distributed import suitable_size
 
 
 class RawMujoco:
-    """``mj_step`` and nothing else: one thread a core, each with its own MjData, taking the worlds one by one.
+    """``mj_step`` alone: one thread a core, each with its own MjData, taking the worlds one by one.
 
-    Every world is stepped through all its control steps by one C call, so neither Python nor the cache of another
-    world costs anything: this is the limit, not a usable loop.
+    One C call steps a world through all its control steps, so neither Python nor cache misses between worlds cost time:
+    this is an upper limit, not a usable loop.
     """
 
     def __init__(self, model: mujoco.MjModel, physics_steps: int) -> None:
@@ -34,7 +34,7 @@ class RawMujoco:
         self.qpos = self.qvel = self.ctrl = np.zeros((0, 0))
 
     def start_from(self, qpos: Tensor, qvel: Tensor, ctrl: Tensor) -> None:
-        """States (N, nq), (N, nv) and joint targets (N, nu) rad that every :meth:`run` begins with."""
+        """Set the states (N, nq), (N, nv) and joint targets (N, nu) rad at the start of every :meth:`run`."""
         self.qpos, self.qvel, self.ctrl = (_double(values) for values in (qpos, qvel, ctrl))
 
     def run(self) -> None:
@@ -55,10 +55,11 @@ def _double(values: Tensor) -> NDArray[np.float64]:
 
 
 def native_rates(config: BenchConfig) -> dict[str, float]:
-    """Raw MuJoCo and the native environment by turns, with ``num_worlds`` worlds and with twice as many.
+    """Raw MuJoCo and the native environment in turn, with ``num_worlds`` worlds and with twice as many.
 
-    The environment in as many processes as training has, and in one with a thread a core. That one and raw MuJoCo begin
-    with the same states and hold the same joint targets; the others with states and targets of the same kind.
+    The environment runs in as many processes as training has, and in one process with a thread per core. The latter and
+    raw MuJoCo begin with the same states and hold the same joint targets; the other processes use states and targets of
+    the same distribution.
     """
     twice = copy.deepcopy(config)
     twice.num_worlds = 2 * config.num_worlds

@@ -1,4 +1,4 @@
-"""The figures as one table and as JSON, each beside the figure that it is to be judged by."""
+"""The figures as one table and as JSON, each with the figures that it is compared with."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import torch
 
 FILE = "bench.json"
 
-# name: what it is, its unit, and the figures that it is compared with
+# name: title, unit, and the figures that it is compared with
 FIGURES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "raw_mujoco_steps_per_s": ("mj_step alone, all cores", "steps/s", ()),
     "native_env_steps_per_s": ("environment, native engine", "steps/s", ("raw_mujoco_steps_per_s",)),
@@ -50,7 +50,7 @@ def ratios(figures: dict[str, float | None]) -> dict[str, float]:
 
 
 def table(figures: dict[str, float | None]) -> str:
-    """One line a figure: what it is, its value, and how it compares."""
+    """One line per figure: its title, its value, and its ratios to others."""
     quotients = ratios(figures)
     lines = []
     for name, (title, unit, bases) in FIGURES.items():
@@ -63,12 +63,12 @@ def table(figures: dict[str, float | None]) -> str:
 
 
 def complete(figures: dict[str, float]) -> dict[str, float | None]:
-    """All names of ``FIGURES``; None for what was not measured."""
+    """All names of ``FIGURES``; None for those not measured."""
     return {name: None if math.isnan(figures.get(name, math.nan)) else figures[name] for name in FIGURES}
 
 
 def machine(device: torch.device) -> dict[str, Any]:
-    """What the figures were measured on. ``load`` is the machine's load average before the first measurement."""
+    """The machine of the measurements. ``load`` is its load average before the first one."""
     gpu = torch.cuda.get_device_name(device) if device.type == "cuda" else None
     return {
         "cpu": _cpu_name(),

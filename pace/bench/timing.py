@@ -1,4 +1,4 @@
-"""Measuring several things by turns, so that a slow moment of the machine falls on all of them."""
+"""Measuring several functions in turn, so that a slow moment of the machine affects all of them."""
 
 from __future__ import annotations
 

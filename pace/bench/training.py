@@ -1,4 +1,4 @@
-"""The whole training loop, as the command that users run: control steps a second and peak memory."""
+"""The whole training loop, run by its command: control steps a second and peak memory."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from pace.config.training import load_train_config
 from pace.runs.run_folder import METRICS
 
 POLL_SECONDS = 0.1  # of the memory's high-water mark, which never falls while a process runs
-WARM_UP_ROWS = 2  # updates that do not count: compilation, allocation
+WARM_UP_ROWS = 2  # excluded updates: compilation, allocation
 PAPER_NETWORKS = {"algo": "paper", "observation": "paper"}  # default physics and task, the paper's networks and critic
 
 
 class BenchError(RuntimeError):
-    """A measured command failed; the message holds the end of what it printed."""
+    """A measured command failed; the message holds the end of its output."""
 
 
 def without(overrides: list[str], *keys: str) -> list[str]:
@@ -43,7 +43,7 @@ def memory_peak(config: BenchConfig, overrides: list[str]) -> dict[str, float]:
 
 
 def training_run(num_worlds: int, updates: int, overrides: list[str]) -> tuple[float, float]:
-    """Train for ``updates`` in a command of its own.
+    """Train for ``updates`` in a separate command.
 
     Returns its control steps a second after the first updates (NaN for a run that is too short), and the largest
     resident memory of its processes together in MiB. Errors: :class:`BenchError` when the command fails.
@@ -78,16 +78,16 @@ def _peak_mib(command: list[str], output: Path) -> float:
 
 
 def _family(pid: int) -> list[int]:
-    """A process and those that it started, such as the helpers of a training run."""
+    """A process and those that it started, such as the workers of a training run."""
     try:
         children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-    except FileNotFoundError:  # it has just ended, or there is no /proc, of which the caller is told
+    except FileNotFoundError:  # it has just ended, or there is no /proc, which the caller reports
         children = []
     return [pid, *(descendant for child in children for descendant in _family(int(child)))]
 
 
 def _resident_peak_mib(pid: int) -> float:
-    """High-water mark of a process that runs; 0 when it has just ended.
+    """High-water mark of a running process; 0 if it has just ended.
 
     Linux counts the parent's own peak into a child's ``ru_maxrss`` (it is kept over exec), so that cannot be used.
     """
@@ -101,7 +101,7 @@ def _resident_peak_mib(pid: int) -> float:
 
 
 def steady_rate(metrics: Path) -> float:
-    """Control steps a second in a run's metrics after its first updates; NaN where there are no more."""
+    """Control steps a second in a run's metrics after its first updates; NaN if there are no more."""
     with metrics.open(newline="") as file:
         rows = list(csv.DictReader(file))
     if len(rows) <= WARM_UP_ROWS:

@@ -23,7 +23,7 @@ Call = Callable[[], object]
 
 
 class RandomTask:
-    """Worlds of random observations and rewards: fills a rollout, costs nothing in the update."""
+    """Worlds of random observations and rewards: they fill a rollout and cost nothing in the update."""
 
     def __init__(self, options: BenchOptions, device: torch.device) -> None:
         worlds = options.update_worlds
@@ -40,7 +40,7 @@ class RandomTask:
         self.reward.normal_()
 
     def reset_worlds(self, mask: Tensor) -> None:
-        """Nothing ever ends here."""
+        """No episode ends."""
 
     def first_bad(self) -> str | None:
         """Random numbers are finite."""
@@ -105,7 +105,7 @@ def matrix_products(options: BenchOptions, algo: AlgoConfig, device: torch.devic
                 for depth, (x, weight, y, weight_gradient, x_gradient) in enumerate(layers):
                     torch.mm(x, weight.t(), out=y)
                     torch.mm(y.t(), x, out=weight_gradient)
-                    if depth > 0:  # nothing is learned from the gradient of an observation
+                    if depth > 0:  # the gradient of an observation is not needed
                         torch.mm(y, weight, out=x_gradient)
 
     return run
@@ -120,9 +120,9 @@ def _layers(rows: int, sizes: list[int], device: torch.device) -> list[tuple[Ten
 
 
 def update_rates(config: BenchConfig, device: torch.device) -> dict[str, float]:
-    """All updates by turns, with the networks, steps, passes and minibatches of ``configs/algo/paper.yaml``.
+    """All updates in turn, with the networks, steps, passes and minibatches of ``configs/algo/paper.yaml``.
 
-    bf16 is left out where the hardware has no units for it, rsl_rl where it is not installed.
+    bf16 is left out if the hardware has no units for it, rsl_rl if it is not installed.
     """
     options, algo = config.bench, load_train_config(["algo=paper"]).algo
     measured: dict[str, Call] = {"ppo_fp32": our_update(options, algo, "fp32", device)}

@@ -1,7 +1,7 @@
-"""Commands: which there are, their help, and wrong input that ends in one line on stderr instead of a traceback.
+"""The command line: table of the commands, their help, and one-line errors for wrong input instead of a traceback.
 
-Here belongs what all commands share; not what one of them does, which is in its room. Imports ``config``, and no torch:
-``--help`` and wrong input are answered at once.
+The common code of all commands belongs here; the work of each command is in its room. Imports ``config``, and no torch:
+``--help`` and errors of wrong input appear at once.
 """
 
 from pace.command.arguments import quote

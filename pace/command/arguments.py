@@ -1,4 +1,4 @@
-"""The command line of a command: arguments without a key, options, and those that are not written as Hydra wants."""
+"""The command line of a command: arguments without a key, options, and the conversion to Hydra's syntax."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from pace.command.table import COMMANDS, TRAIN_GROUPS, Command
 from pace.config.base import ConfigError, meant
 from pace.config.names import check_renamed, split_override
 
-#: Options of Hydra that the next argument is the value of.
+#: Options of Hydra whose value is the next argument.
 HYDRA_OPTIONS = ("--cfg", "-c", "--info", "-i", "--package", "-p", "--config-name", "-cn", "--config-dir", "-cd")
 
 
 def prepare(name: str, arguments: Sequence[str]) -> list[str]:
-    """Arguments of the command ``name`` as Hydra wants them, its own keys and groups only.
+    """Arguments of the command ``name`` in Hydra's syntax, with its own keys and groups only.
 
-    Errors: :class:`ConfigError`, one line that says what to write instead.
+    Errors: :class:`ConfigError`, one line with the correct form.
     """
     command = COMMANDS[name]
     given = name_options(list(arguments), command)
@@ -86,7 +86,7 @@ def is_plain(arguments: Sequence[str], index: int) -> bool:
 
 
 def name_argument(arguments: list[str], key: str) -> list[str]:
-    """``arguments`` with the first one that has no key written as ``key='...'``, the way Hydra wants it."""
+    """``arguments`` with the first one that has no key written as ``key='...'``, in Hydra's syntax."""
     for index, argument in enumerate(arguments):
         if is_plain(arguments, index):
             return [*arguments[:index], f"{key}={quote(argument)}", *arguments[index + 1 :]]
@@ -101,7 +101,7 @@ def name_list(arguments: list[str], key: str) -> list[str]:
 
 
 def quote(value: str) -> str:
-    """``value`` the way Hydra takes any text, such as a path with a ``=`` in it."""
+    """``value`` quoted for Hydra, such as a path with a ``=`` in it."""
     escaped = value.replace("\\", "\\\\").replace("'", "\\'")
     return f"'{escaped}'"
 
@@ -121,7 +121,7 @@ def is_override(arguments: Sequence[str], index: int) -> bool:
 
 
 def check_keys(name: str, command: Command, arguments: Sequence[str]) -> None:
-    """Errors: :class:`ConfigError` for an argument whose key the command does not have, or would not look at."""
+    """Errors: :class:`ConfigError` for an argument whose key the command does not have, or would ignore."""
     own = {key.split(".")[0] for key in command_keys(command)}
     known = [*own, *command.groups, *command.training_keys]
     more_groups = any(argument.startswith(("--config-dir", "-cd", "hydra.searchpath")) for argument in arguments)
@@ -138,7 +138,7 @@ def check_keys(name: str, command: Command, arguments: Sequence[str]) -> None:
 
 
 def _unknown(name: str, root: str, known: Collection[str]) -> str:
-    """What is wrong with a key that a command does not have."""
+    """The message for a key that a command does not have."""
     elsewhere = (*TRAIN_GROUPS, *(key.split(".")[0] for key in command_keys(COMMANDS["train"])))
     if root in elsewhere:
         return f"{root}= is of pace train, and changes nothing in pace {name} (--help lists the keys)"
@@ -148,7 +148,7 @@ def _unknown(name: str, root: str, known: Collection[str]) -> str:
 def collect_overrides(arguments: list[str], groups: tuple[str, ...]) -> list[str]:
     """``arguments`` with those for ``groups``, such as ``ball=paper`` or ``engine.cone=elliptic``, moved into a list.
 
-    The list is the value of the key ``overrides``: a saved task is no part of what Hydra composes.
+    The list is the value of the key ``overrides``, because Hydra does not compose a saved task.
     """
     moved = [a for a in arguments if "=" in a and a.split("=")[0].split(".")[0] in groups]
     rest = [a for a in arguments if a not in moved]

@@ -1,6 +1,6 @@
-"""``--help``: what a command does, its keys with their defaults and comments, and the groups that it takes.
+"""``--help``: a command's purpose, its keys with their defaults and comments, and its groups.
 
-Keys and comments are read from ``configs/``, so that they are written down once.
+Keys and comments are read from ``configs/``, so that they are written only once.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from pace.config.base import ConfigError, config_dir, meant
 from pace.config.names import check_choice, choices
 
 WIDTH = 96
-COLUMN = 34  # where comments begin
+COLUMN = 34  # of the comments
 
 
 def overview() -> str:
-    """The commands, a line each."""
+    """The commands, one per line."""
     lines = [f"  pace {name:<11}{command.summary}" for name, command in COMMANDS.items()]
     return "\n".join(
         ["PACE: a humanoid learns table tennis.", "", *lines, "", "pace COMMAND --help lists a command's keys."]
@@ -29,7 +29,7 @@ def overview() -> str:
 def command_help(name: str, topic: str = "") -> str:
     """The help of a command; with ``topic``, ``GROUP`` or ``GROUP=CHOICE``, that of a group's keys.
 
-    Errors: :class:`ConfigError` for a group that the command does not take, and for a choice that is not there.
+    Errors: :class:`ConfigError` for a group that the command does not take, and for an unknown choice.
     """
     command = COMMANDS[name]
     if topic:
@@ -45,12 +45,12 @@ def command_help(name: str, topic: str = "") -> str:
 
 
 def capital(text: str) -> str:
-    """``text`` with a capital letter at its beginning."""
+    """``text`` with a capital first letter."""
     return text[0].upper() + text[1:]
 
 
 def command_keys(command: Command) -> dict[str, Key]:
-    """Keys of a command by name: those of its file, then what it takes of the training's."""
+    """Keys of a command by name: those of its file, then those of the training that it takes."""
     own = file_keys(config_dir() / f"{command.config}.yaml")
     training = file_keys(config_dir() / "train.yaml")
     taken = {name: own.get(name, training[name]) for name in command.training_keys}
@@ -59,7 +59,7 @@ def command_keys(command: Command) -> dict[str, Key]:
 
 
 def key_table(keys: Iterable[Key]) -> str:
-    """A line ``key=default  comment`` for each key; long comments go on below."""
+    """A line ``key=default  comment`` for each key; long comments continue below."""
     lines = []
     for key in keys:
         start = fill(f"  {key.name}={key.default}", WIDTH, subsequent_indent="    ", break_long_words=False)
@@ -84,13 +84,13 @@ def group_table(name: str, command: Command) -> str:
             continue
         known = [f"{choice}*" if choice == defaults.get(group) and not preset else choice for choice in choices(group)]
         lines.append(fill(", ".join(known), WIDTH, initial_indent=f"  {group + '=':<16}", subsequent_indent=" " * 18))
-    usual = f"what is not given is {preset}" if preset else "* is the default"
+    usual = f"default: {preset}" if preset else "* is the default"
     more = f"pace {name} --help GROUP shows a group's keys, --help GROUP=CHOICE those of another choice."
     return f"Groups, GROUP=CHOICE or GROUP.KEY=VALUE ({usual}):\n" + "\n".join(lines) + f"\n\n{more}"
 
 
 def default_choices(command: Command) -> Mapping[str, str]:
-    """Choice of each group that the file of a command, or else that of the training, names."""
+    """Choice of each group in the file of a command, or else in that of the training."""
     files = (config_dir() / "train.yaml", config_dir() / f"{command.config}.yaml")
     return {
         match[1]: match[2]

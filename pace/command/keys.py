@@ -18,7 +18,7 @@ NO_ITEM = 1_000  # an indentation that no line has
 
 @dataclass(frozen=True)
 class Key:
-    """A key by its full name, its default as it stands in the file, and what the file says of it."""
+    """A key by its full name, its default as written in the file, and its comment."""
 
     name: str
     default: str
@@ -26,10 +26,10 @@ class Key:
 
 
 def file_keys(file: Path) -> dict[str, Key]:
-    """Keys of ``file`` by name, after those of the files of its group that its ``defaults`` take over.
+    """Keys of ``file`` by name, after those of the files of its group in its ``defaults``.
 
-    A comment belongs to the key in its line, or to the next key when it stands above that, at its indentation. What is
-    said of a key that only holds others goes to the first of those.
+    A comment belongs to the key in its line, or to the next key if it stands above that, at its indentation. The
+    comment of a key that only holds others goes to the first of those.
     """
     text = file.read_text()
     found: dict[str, Key] = {}
@@ -51,7 +51,7 @@ def file_keys(file: Path) -> dict[str, Key]:
 
 
 def heading(file: Path) -> str:
-    """What the comment at the top of ``file`` says of the whole."""
+    """The comment at the top of ``file``, on the whole file."""
     return " ".join(line.lstrip("# ") for line in _head(file.read_text()) if not line.startswith("# @package"))
 
 
@@ -76,7 +76,7 @@ def flow(value: Any) -> str:
 
 
 def read_comments(lines: Sequence[str]) -> list[tuple[str, str]]:
-    """Full name of each key of a YAML file that begins a line, in order, and what is said of it."""
+    """Full name of each key of a YAML file that begins a line, in order, and its comments."""
     keys: list[tuple[str, str]] = []
     path: list[tuple[int, str]] = []  # indentation and name of the keys around the current line
     above: list[tuple[int, str]] = []  # comments that stand alone, with their indentation
@@ -103,7 +103,7 @@ def read_comments(lines: Sequence[str]) -> list[tuple[str, str]]:
 
 
 def _add(keys: list[tuple[str, str]], comments: Sequence[str]) -> None:
-    """Add ``comments`` to what is said of the last key."""
+    """Add ``comments`` to those of the last key."""
     if keys:
         name, said = keys[-1]
         keys[-1] = (name, " ".join(text for text in (said, *comments) if text))

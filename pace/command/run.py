@@ -1,4 +1,4 @@
-"""Running a command so that wrong input ends in one line on stderr, not in a traceback."""
+"""Running a command; wrong input gives one line on stderr instead of a traceback."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ EXIT_INTERRUPTED = 130
 def run_command(name: str) -> int:
     """Run the command ``name`` of :data:`COMMANDS` with ``sys.argv``; returns the exit status.
 
-    Its work is imported when the configuration is composed, for torch takes seconds to load, and gets that
-    configuration. Modules that the user names, in ``plugins`` or by an import path, are imported first
-    (:mod:`pace.config.plugins`). Wrong input gives one line and status 2, an expected error one line and 1.
+    The command's function is imported after the configuration is composed, because torch takes seconds to load. Modules
+    that the user names, in ``plugins`` or by an import path, are imported first (:mod:`pace.config.plugins`). Wrong
+    input gives one line and status 2, an expected error one line and 1.
     """
     try:
         if {"-h", "--help"} & set(sys.argv[1:]):
@@ -49,7 +49,7 @@ def run_command(name: str) -> int:
 
 
 def _topic(arguments: Sequence[str]) -> str:
-    """The group that stands behind ``--help``, if one does; a path there is the RUN of the command."""
+    """The group after ``--help``, if any; a path there is the RUN of the command."""
     index = min(arguments.index(flag) for flag in ("-h", "--help") if flag in arguments)
     return next((argument for argument in arguments[index + 1 :] if re.fullmatch(r"\w+(=[\w/]+)?", argument)), "")
 
@@ -60,7 +60,7 @@ def _run_hydra(command: Command) -> int:
     status = 0
 
     def guarded(config: DictConfig) -> None:
-        nonlocal status  # an error that reached Hydra would be announced a second time
+        nonlocal status  # an error that reached Hydra would be printed a second time
         try:
             work, *failures = (resolve_name(path) for path in (command.work, *command.failures))
         except ModuleNotFoundError as error:
@@ -90,7 +90,7 @@ def _given_folders() -> list[Path]:
 
 
 def explain(name: str, arguments: Sequence[str], error: Exception) -> str:
-    """A line on what Hydra cannot compose: the key or the choice that was probably meant."""
+    """One line for an error of Hydra's composition, with the key or the choice that was probably meant."""
     command = COMMANDS[name]
     for override in plain_overrides(arguments):
         key, value = split_override(override)
@@ -110,11 +110,11 @@ def explain(name: str, arguments: Sequence[str], error: Exception) -> str:
 
 
 def show(text: str) -> int:
-    """Print ``text``, to a reader that may leave before its end (``| head``); returns the exit status."""
+    """Print ``text``, to a reader that may close the pipe early (``| head``); returns the exit status."""
     try:
         print(text, flush=True)
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains when it ends
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python prints an error at exit
     return 0
 
 

@@ -1,4 +1,4 @@
-"""The commands of ``pace``: which configuration each has, and what of it the command line may give."""
+"""The commands of ``pace``: their configurations, and the keys that the command line may give."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ TRAIN_GROUPS = (
 )  # fmt: skip
 CHECKPOINT_ERROR = "pace.runs.checkpoint:CheckpointError"
 SAVED_RUN = (
-    "RUN is a run folder, a checkpoint in one, or pretrained/<name>. The task is the one that was saved with the "
+    "RUN is a run folder, a checkpoint in one, or pretrained/<name>. The task is the one saved with the "
     "policy; change it as in training, by a choice of a group (ball=paper) or a value (engine.solver_iterations=20)."
 )
 
@@ -26,8 +26,8 @@ class Command:
     work: str  # module:function of the composed configuration, imported when there is one
     config: str  # configs/<config>.yaml, whose keys it takes
     summary: str  # one line
-    failures: tuple[str, ...] = ()  # module:error of the errors that it may end with
-    usage: str = "[key=value ...]"  # what stands behind its name
+    failures: tuple[str, ...] = ()  # module:error of its expected errors
+    usage: str = "[key=value ...]"  # the text after its name
     about: str = ""  # a paragraph of the help
     examples: tuple[str, ...] = ()  # without the command's name
     positional: tuple[str, ...] = ()  # keys of the arguments without a key, in order
@@ -36,9 +36,9 @@ class Command:
     flags: tuple[str, ...] = ()  # keys that may be written --key, for key=true
     groups: tuple[str, ...] = ()  # choices of configs/ that it takes, and single values of them
     training_keys: tuple[str, ...] = ()  # keys of configs/train.yaml that it takes besides its own
-    collected: bool = False  # what is of `groups` and `training_keys` goes into its key `overrides`, as a list
-    extra: str = ""  # of the package, that it may need
-    refused: dict[str, str] = field(default_factory=dict)  # key or group, which would change nothing -> what does
+    collected: bool = False  # arguments of `groups` and `training_keys` go into its key `overrides`, as a list
+    extra: str = ""  # extra of the package that it may need
+    refused: dict[str, str] = field(default_factory=dict)  # key or group without effect -> the one to use instead
 
 
 COMMANDS = {
@@ -49,7 +49,7 @@ COMMANDS = {
         config="train",
         summary="train a policy and its predictor",
         about="Writes a run folder: configuration, versions, metrics, checkpoints and learning curve. Ctrl-C saves and "
-        "ends; resume= goes on exactly there.",
+        "ends; resume= resumes exactly there.",
         examples=(
             "minutes=10 num_worlds=512 seed=3",
             "experiment=paper device=cuda     # the paper's numbers",
@@ -67,7 +67,7 @@ COMMANDS = {
         summary="hits and returns of a policy in the paper's serve ranges, and its robustness (--sweep)",
         usage="RUN [--sweep] [key=value ...]",
         about=SAVED_RUN + " policy=zero and policy=random need no RUN. --sweep also plays the task with one change at "
-        "a time; with rows=[] that is all that is played, and out=FOLDER resumes an interrupted sweep.",
+        "a time; with rows=[] only the sweep runs, and out=FOLDER resumes an interrupted sweep.",
         examples=(
             "pretrained/pace serves=500 sensing=paper ball=paper",
             "runs/2026-01-01_pace rows=[mixed] engine=mjwarp",
@@ -87,7 +87,7 @@ COMMANDS = {
         failures=(CHECKPOINT_ERROR, "pace.sim.render:RenderError", "pace.viewer.web:PageError"),
         extra="viewer",
         config="play",
-        summary="a policy on a live page in the browser, or in a film (--video FILE)",
+        summary="a policy on a live page in the browser, or in a video (--video FILE)",
         usage="RUN [--video FILE.mp4] [key=value ...]",
         about=SAVED_RUN,
         examples=(
@@ -118,7 +118,7 @@ COMMANDS = {
         work="pace.studies.ablation:ablate_from_config",
         failures=("pace.studies.ablation:AblationError", CHECKPOINT_ERROR),
         config="ablate",
-        summary="experiments x seeds, trained one after another, and the figure that compares them",
+        summary="experiments x seeds, trained one after another, and a figure to compare them",
         about="Runs, CSVs and figure are in the folder out. The same command again skips finished runs and resumes the "
         "others. Keys and choices of the training change every run.",
         examples=(
@@ -184,7 +184,7 @@ COMMANDS = {
         failures=(CHECKPOINT_ERROR,),
         extra="dev",
         config="studies",
-        summary="engines, step sizes, motors, what a predictor can know, ...: measured anew (extra dev)",
+        summary="measurements of engines, step sizes, motors, predictors, ... (extra dev)",
         usage="STUDY [STUDY ...] [key=value ...]",
         about="Prints the tables of the documentation and draws their figures. STUDY: reaction, parity, steps, solver, "
         "motors, predictor, posture, adaptation, senses, rounding, recipe, learning, architecture, or all.",

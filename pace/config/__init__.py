@@ -1,6 +1,6 @@
 """Typed configuration: the dataclasses of ``configs/``, and the check of YAML against them.
 
-Here belongs what a key means, its type and its range; not what is done with it. Imports nothing of the package.
+The meaning, type and range of each key belong here; their use does not. Imports nothing of the package.
 """
 
 from pace.config.base import ConfigError

@@ -1,7 +1,7 @@
 """Typed configuration: one dataclass per group of ``configs/``, and the check of YAML against it.
 
-Every number of the task, the physics and the learning lives in the YAML files, with its unit and source. The classes
-here say which keys exist and of what type they are; an unknown key, a wrong type or a value out of range raises
+Every number of the task, the physics and the learning is in the YAML files, with its unit and source. The classes
+here declare the keys and their types; an unknown key, a wrong type or a value out of range raises
 :class:`ConfigError` with the key's full name.
 """
 
@@ -86,7 +86,7 @@ def parse(config: DictConfig | dict[str, Any], schema: type[T]) -> T:
 
 
 def _reason(error: OmegaConfBaseException) -> str:
-    """What is wrong with a key, in a line."""
+    """The error of a key, in one line."""
     text = str(error).split("\n")[0]
     if isinstance(error, ConfigKeyError) and is_dataclass(error.object_type):
         return text + meant(str(error.key), [field.name for field in fields(error.object_type)])
@@ -94,7 +94,7 @@ def _reason(error: OmegaConfBaseException) -> str:
 
 
 def meant(word: str, known: Iterable[str]) -> str:
-    """``; did you mean ...?`` when ``word`` is close to one of ``known``, and else nothing."""
+    """``; did you mean ...?`` if ``word`` is close to one of ``known``, else an empty string."""
     near = get_close_matches(word, list(known), 1)
     return f"; did you mean {near[0]}?" if near else ""
 

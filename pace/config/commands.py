@@ -10,7 +10,7 @@ from pace.config.training import TrainConfig
 
 @dataclass
 class BenchOptions:
-    """What ``python -m pace.bench`` measures, and how long."""
+    """Parts and duration of the measurements of ``python -m pace.bench``."""
 
     parts: list[str]  # of physics, mjwarp, update, train, memory
     repeats: int
@@ -35,7 +35,7 @@ class BenchOptions:
 
 @dataclass
 class BenchConfig(TrainConfig):
-    """``python -m pace.bench``: what is trained, and how it is measured."""
+    """``python -m pace.bench``: the training task, and the measurements."""
 
     bench: BenchOptions
 
@@ -68,12 +68,12 @@ class VariationConfig:
 
 @dataclass
 class EvaluateConfig:
-    """``python -m pace.evaluation``: which policy, on what task, how many serves."""
+    """``python -m pace.evaluation``: the policy, its task, and the number of serves."""
 
     run: str | None
     policy: str  # run, zero, random
     rows: list[str]  # names of configs/serve/
-    serves: int  # at least so many a row
+    serves: int  # least number of serves per row
     warmup_serves: int  # first serves of each world, not counted
     num_worlds: int
     device: str
@@ -83,7 +83,7 @@ class EvaluateConfig:
     out: str | None
     progress: bool
     sweep: bool
-    sweep_serves: int  # at least so many a row of a cell
+    sweep_serves: int  # least number of serves per row of a cell
     sweep_serves_slow: int  # the same for mjwarp on a CPU
     sweep_rows: list[str]
     variations: VariationConfig
@@ -102,7 +102,7 @@ class EvaluateConfig:
 
 @dataclass
 class ExportConfig:
-    """``python -m pace.deploy``: which policy, where to, and how it is checked."""
+    """``python -m pace.deploy``: the policy, the folder, and the check of the export."""
 
     run: str | None
     out: str | None  # folder; null: runs/<date>_export
@@ -120,7 +120,7 @@ class ExportConfig:
 
 @dataclass
 class PlayConfig:
-    """``python -m pace.viewer``: which policy, where it is shown, or what is filmed."""
+    """``python -m pace.viewer``: the policy, and the page or the video."""
 
     run: str | None
     host: str
@@ -150,7 +150,7 @@ class PlayConfig:
 
 @dataclass
 class AblateConfig:
-    """``python -m pace.studies.ablate``: which experiments, with which seeds, and how long."""
+    """``python -m pace.studies.ablate``: the experiments, their seeds, and their length."""
 
     experiments: list[str]  # names of configs/experiment/
     seeds: list[int]
@@ -176,7 +176,7 @@ class AblateConfig:
 
 @dataclass
 class KeepConfig:
-    """``python -m pace.evaluation.keep``: which run becomes a published policy, and where."""
+    """``python -m pace.evaluation.keep``: the run to publish, and the folder."""
 
     run: str | None
     out: str | None
@@ -190,14 +190,14 @@ class KeepConfig:
 
 @dataclass
 class ValidateConfig:
-    """``python -m pace.studies.ball``: where its figures go."""
+    """``python -m pace.studies.ball``: the folder of its figures."""
 
     out: str | None
 
 
 @dataclass
 class StudiesConfig:
-    """``python -m pace.studies``: which measurements, of what, and how much of it."""
+    """``python -m pace.studies``: the measurements, their subject, and their size."""
 
     studies: list[str]  # names, or all
     worlds: int

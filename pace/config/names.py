@@ -1,4 +1,4 @@
-"""Names in ``configs/``: the choices of a group, and what is said of a wrong or an old one."""
+"""Names in ``configs/``: the choices of a group, and the errors for a wrong or an old one."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ RENAMED_KEYS = {"run_dir": "out"}
 
 
 def choices(group: str) -> list[str]:
-    """Choices of ``group``: the files below configs/<group>, but for parts of others, which begin with ``_``."""
+    """Choices of ``group``: the files below configs/<group>, except parts of others, which begin with ``_``."""
     folders = [folder / group for folder in config_dirs()]
     found = {
         file.relative_to(folder).with_suffix("").as_posix() for folder in folders for file in folder.rglob("*.yaml")
@@ -29,7 +29,7 @@ def split_override(override: str) -> tuple[str, str]:
 
 
 def check_renamed(overrides: Iterable[str]) -> None:
-    """Errors: :class:`ConfigError`, one line with the new name, for a key or a choice that has another name now."""
+    """Errors: :class:`ConfigError`, one line with the new name, for a renamed key or choice."""
     for override in overrides:
         key, value = split_override(override)
         if key in RENAMED_KEYS:
@@ -41,7 +41,7 @@ def check_renamed(overrides: Iterable[str]) -> None:
 
 
 def check_choice(group: str, choice: str) -> None:
-    """Errors: :class:`ConfigError` that lists the choices of ``group`` when ``choice`` is none of them."""
+    """Errors: :class:`ConfigError` that lists the choices of ``group`` if ``choice`` is none of them."""
     if not any((folder / group / f"{choice}.yaml").is_file() for folder in config_dirs()):
         known = choices(group)
         raise ConfigError(f"{group}/{choice} does not exist{meant(choice, known)} ({group}: {', '.join(known)})")

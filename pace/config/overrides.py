@@ -1,4 +1,4 @@
-"""Changing the task that was saved with a policy or a run."""
+"""Changing the task saved with a policy or a run."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from pace.config.base import ConfigError, compose, parse, to_dict
 from pace.config.names import check_choice, check_renamed
 from pace.config.training import TrainConfig
 
-#: Groups of configs/ that may be chosen anew for a saved policy; networks and observations may not.
+#: Groups of configs/ whose choice may change for a saved policy; networks and observations may not.
 TASK_GROUPS = ("ball", "serve", "reset", "randomization", "sensing", "reward", "robot")
 
 
-#: Parts of a saved task of which single values may be changed.
+#: Parts of a saved task in which single values may change.
 TASK_VALUES = ("landing_target",)
 CHANGEABLE = (*TASK_GROUPS, "engine", *TASK_VALUES)
 
 
-#: Changes of a saved task that is played on a CPU, one world or a few, whatever it was trained on.
+#: Changes of a saved task for one world or a few on a CPU, whatever it was trained on.
 ON_A_CPU = ("engine=native", "engine.threads=1", "engine.graph=auto")
 
 
 def stage_tasks(config: TrainConfig, samples: float = math.inf) -> list[TrainConfig]:
-    """``config``, and what each stage of its curriculum that has begun by ``samples`` makes of the one before.
+    """``config``, then each stage of its curriculum that has begun by ``samples``, applied to the one before.
 
-    Errors: :class:`ConfigError` for a change that the task does not know, which names the stage.
+    Errors: :class:`ConfigError`, which names the stage, for a change of an unknown key.
     """
     tasks = [config]
     for stage in config.curriculum:
@@ -45,12 +45,12 @@ def stage_tasks(config: TrainConfig, samples: float = math.inf) -> list[TrainCon
 
 
 def override_task(config: TrainConfig, overrides: Sequence[str]) -> TrainConfig:
-    """A saved configuration with parts of its task changed; ``config`` itself stays as it is.
+    """A saved configuration with parts of its task changed; ``config`` is not changed.
 
     An override is a choice of a group, ``ball=paper`` (of :data:`TASK_GROUPS`; ``engine=native`` keeps the saved
     solver), or a value, ``engine.physics_dt=0.002``. Choices are applied before values, later ones win.
 
-    Errors: :class:`ConfigError` for anything else, and for keys and values that the configuration does not know.
+    Errors: :class:`ConfigError` for anything else, and for unknown keys and values.
     """
     check_renamed(overrides)
     choices: dict[str, str] = {}
@@ -77,7 +77,7 @@ def override_task(config: TrainConfig, overrides: Sequence[str]) -> TrainConfig:
 
 
 def without_reward(config: TrainConfig) -> TrainConfig:
-    """The same task for a policy that is only played: its reward has no terms, so that none has to be known."""
+    """The same task to roll out a policy: its reward has no terms, so that none has to be known."""
     return replace(config, reward=replace(config.reward, terms={}))
 
 

@@ -1,10 +1,10 @@
-"""What comes from outside of the package: reward terms, observations, algorithms, engines, predictors by name.
+"""Plugins from outside of the package: reward terms, observations, algorithms, engines, predictors by name.
 
 Each kind has a :class:`Registry`. A name in the configuration is, in this order: a member of the registry, which the
 package or a module that the user has named entered there; an installed entry point of the registry's group; an import
 path ``module:attribute``. The module of an import path must have been named (:func:`use`): by the key ``plugins`` of a
-command, or by the path itself in a configuration that the user composes. A path in a saved run or policy names
-nothing, so loading one imports nothing.
+command, or by the path itself in a configuration that the user composes. A path in a saved run or policy does not count
+as naming, so loading one imports nothing.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ _named: set[str] = set()  # modules that the user of this process has named
 
 
 class Registry(dict[str, T], Generic[T]):
-    """Things of one kind by name; ``registry[name]`` finds those from outside, too.
+    """Objects of one kind by name; ``registry[name]`` finds those from outside, too.
 
     Args:
-        kind, where: what they are and what stands before their names, for messages.
+        kind, where: name of the kind and prefix of its names, for messages.
         group: of the entry points.
-        accept: checks, or converts, what was found outside; errors: ``TypeError`` that says what is wanted.
+        accept: checks, or converts, an object from outside; errors: ``TypeError`` that says what is expected.
         members: those of the package.
 
     Errors of ``registry[name]``: :class:`ConfigError` for an unknown name, a module that was not named or that cannot
-    be imported, and for what is not of this kind.
+    be imported, and an object of another kind.
     """
 
     groups: ClassVar[dict[str, Registry[Any]]] = {}
@@ -74,7 +74,7 @@ class Registry(dict[str, T], Generic[T]):
             raise ConfigError(f"{self.kind} '{name}': {error}") from error
 
     def enter(self, name: str, member: T) -> None:
-        """Add a member. Errors: :class:`ConfigError` for a name that is taken."""
+        """Add a member. Errors: :class:`ConfigError` for a name that exists already."""
         if name in self and self[name] != member:
             raise ConfigError(f"there is a {self.kind} '{name}' already: give yours another name")
         self[name] = member
@@ -99,7 +99,7 @@ def use(modules: Iterable[str]) -> None:
 
 
 def attribute(path: str) -> Any:
-    """What ``module:attribute`` names.
+    """The object ``module:attribute``.
 
     Errors: :class:`ConfigError` for a module that was not named (:func:`use`) or that has no such attribute.
     """
@@ -122,7 +122,7 @@ def _import(module: str) -> Any:
 def use_named(composed: DictConfig) -> None:
     """:func:`use` the modules of ``plugins`` and of each import path in what the user has composed.
 
-    ``plugins`` then holds all of them, so that a saved configuration says what it needs.
+    ``plugins`` then holds all of them, so that a saved configuration names the modules that it needs.
     """
     found = [path.partition(":")[0] for path in _import_paths(composed)]
     composed["plugins"] = list(dict.fromkeys([*(composed.get("plugins") or []), *found]))

@@ -1,4 +1,4 @@
-"""The learned predictor: its configuration, and what it takes for granted about serves."""
+"""The learned predictor: its configuration, and its priors of the serves."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields
 from pace.config import plugins
 from pace.config.base import require
 
-COUNTED_FRAMES = 5  # the last positions that ``predictor.features=counted`` sees
+COUNTED_FRAMES = 5  # the last positions that ``predictor.features=counted`` takes
 
 
 FEATURES = ("steps", "counted", "flight")
@@ -18,7 +18,7 @@ FRAME_DT = 0.02  # s, between the positions that ``predictor.features=flight`` f
 
 @dataclass
 class Prior:
-    """What a quantity usually is, and how much it differs: mean (centre) and standard deviation (scale), by axis."""
+    """Mean (centre) and standard deviation (scale) of a quantity, by axis."""
 
     mean: list[float]
     std: list[float]
@@ -30,18 +30,18 @@ class Prior:
 
 @dataclass
 class PredictorPriors:
-    """What the predictor takes for granted about serves (world frame; x, y, z): the scales of its numbers.
+    """The predictor's priors of the serves (world frame; x, y, z): the scales of its numbers.
 
-    A network's weights belong to the priors that it was trained with, which are therefore saved with it. The defaults
-    were measured on the released training serves; :mod:`pace.predictor.priors` carries them over to other ones. Saved
-    predictors that do not name theirs were trained with these.
+    A network's weights belong to the priors that it was trained with, so these are saved with it. The defaults were
+    measured on the released training serves; :mod:`pace.predictor.priors` transfers them to other serves. Saved
+    predictors without priors were trained with the defaults.
     """
 
-    # of the fit (features=flight): the launch, whose position is seen; both accelerations, of drag 4 m/s^2 at 6 m/s
+    # of the fit (features=flight): the launch, whose position is sensed; both accelerations, of drag 4 m/s^2 at 6 m/s
     launch_velocity: Prior = field(default_factory=lambda: Prior([-5.75, -0.2, 1.75], [0.6, 0.5, 0.25]))  # m/s
     fall: Prior = field(default_factory=lambda: Prior([4.0, 0.0, -9.8], [0.8, 0.2, 0.3]))  # m/s^2, before the bounce
     rise: Prior = field(default_factory=lambda: Prior([2.0, 0.0, -10.4], [0.4, 0.2, 0.4]))  # m/s^2, after it
-    # what the fit finds: velocities before and after the bounce, and where it bounces
+    # results of the fit: velocities before and after the bounce, and its position
     fall_velocity: Prior = field(default_factory=lambda: Prior([-5.2, -0.2, -0.5], [0.5, 0.35, 1.5]))  # m/s
     rise_velocity: Prior = field(default_factory=lambda: Prior([-4.1, -0.15, 2.6], [0.5, 0.3, 0.25]))  # m/s
     bounce: Prior = field(default_factory=lambda: Prior([-1.0, -0.1, 0.78], [0.25, 0.2, 0.02]))  # m
@@ -65,14 +65,14 @@ class PredictorConfig:
     """The learned predictor of the ball's apex and its online regression."""
 
     name: str
-    frames: int  # past ball positions it sees
+    frames: int  # past ball positions in its input
     hidden: list[int]
     learning_rate: float
     batch_size: int
     batches_per_update: int
     train_updates: int  # frozen afterwards; 0 trains it to the end
     outputs: list[str]  # of apex (3), target (3), target_time (1)
-    enabled: bool  # off: the actor sees zeros instead (ablation)
+    enabled: bool  # off: the actor gets zeros instead (ablation)
     features: str = "steps"  # steps (positions alone), counted (the last five, and how many there were before them) or
     # flight (a fit of the whole flight), which both need many frames; or from outside: my_module:MyPredictor
     priors: PredictorPriors | None = None  # null: derived from the serve when a run starts, and saved with it

@@ -1,4 +1,4 @@
-"""Choices of ``configs/`` that once had another name: what they are called now."""
+"""Renamed choices of ``configs/``: old and current names."""
 
 from __future__ import annotations
 
@@ -44,13 +44,13 @@ def with_current_names(saved: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _current_stage(stage: Any) -> Any:
-    """A stage of a curriculum; anything else stays as it is, for the check against the dataclasses to complain of."""
+    """A stage of a curriculum; anything else is unchanged, and the check against the dataclasses reports it."""
     if not isinstance(stage, Mapping) or not isinstance(stage.get("task"), list):
         return stage
     return {**stage, "task": [current_override(text) if isinstance(text, str) else text for text in stage["task"]]}
 
 
 def current_override(text: str) -> str:
-    """An override such as ``randomization=full`` with the current name of its choice; others as they are."""
+    """An override such as ``randomization=full`` with the current name of its choice; others unchanged."""
     group, equals, choice = text.partition("=")
     return f"{group}={renamed_choice(group, choice)}" if equals else text

@@ -1,4 +1,4 @@
-"""What the physics worlds need: robot, ball, engine, randomization, sensing."""
+"""Configuration of the physics worlds: robot, ball, engine, randomization, sensing."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class JointGroup:
     kp: float  # N m / rad
     kd: float  # N m s / rad
     effort: float  # N m
-    max_speed: float = 0.0  # rad/s, at which the motor gives no torque; needed where robot.stall_ratio is on
+    max_speed: float = 0.0  # rad/s, at which the motor has no torque; needed if robot.stall_ratio is on
 
 
 @dataclass
@@ -37,8 +37,8 @@ class RobotConfig:
     armature: float  # kg m^2
     base_height: float  # m, base above the floor at reset
     joint_groups: list[JointGroup]  # the first match of a joint counts
-    nominal_pose: dict[str, float]  # rad; joints not named stand at 0
-    stall_ratio: float = 0.0  # stall torque over effort; 0: full effort at any speed, as before there was a limit
+    nominal_pose: dict[str, float]  # rad; joints not named are at 0
+    stall_ratio: float = 0.0  # stall torque over effort; 0: full effort at any speed (earlier policies)
 
     def __post_init__(self) -> None:
         require(self.control_dt > 0, "robot.control_dt must be positive")
@@ -52,7 +52,7 @@ class RobotConfig:
 
 @dataclass
 class TableConfig:
-    """Table, net, floor and paddle as the ball meets them; world frame, origin under the table's centre."""
+    """Table, net, floor and paddle for the ball's collisions; world frame, origin under the table's centre."""
 
     length: float  # m, along x
     width: float  # m, along y
@@ -96,7 +96,7 @@ class BallConfig:
 
 @dataclass
 class RandomizationConfig:
-    """Per-world draws at each reset. ``[1, 1]`` scales and ``[0, 0]`` offsets are a clean run."""
+    """Ranges of each world's parameters, sampled at each reset. ``[1, 1]`` and ``[0, 0]``: no randomisation."""
 
     name: str
     friction: Range  # sliding friction of robot bodies with floor and table
@@ -126,7 +126,7 @@ class RandomizationConfig:
 
 @dataclass
 class SensingConfig:
-    """What the robot's sensors add to the truth: uniform noise (+- amplitude) and delay."""
+    """Errors of the robot's sensors: uniform noise (+- amplitude) and delay."""
 
     name: str
     base_angular_velocity: float  # rad/s
@@ -137,9 +137,11 @@ class SensingConfig:
     ball_position: float  # m
     heading: float
     base_shift: float  # m
-    mocap_delay: Range  # s, drawn per world at reset: ball, base position and heading
-    noise_scale: Range = field(default_factory=lambda: [1.0, 1.0])  # of all amplitudes, drawn per world at reset
-    moved: float = 0.03  # m; a ball seen so much further away than two control steps before has turned: noise does less
+    mocap_delay: Range  # s, sampled per world at reset: ball, base position and heading
+    noise_scale: Range = field(default_factory=lambda: [1.0, 1.0])  # of all amplitudes, sampled per world at reset
+    # m; the ball counts as returned once it is sensed this much farther away than two control steps earlier; noise
+    # alone stays below the threshold
+    moved: float = 0.03
 
     def __post_init__(self) -> None:
         check_range("sensing.mocap_delay", self.mocap_delay, lowest=0.0)
@@ -157,8 +159,8 @@ class EngineConfig:
     line_search_iterations: int
     cone: str  # pyramidal, elliptic
     threads: int  # native: 0 is all cores
-    contacts_per_world: int  # mjwarp: room for contacts
-    constraints_per_world: int  # mjwarp: room for constraint rows
+    contacts_per_world: int  # mjwarp: memory for contacts
+    constraints_per_world: int  # mjwarp: memory for constraint rows
     paddle_reaction: bool  # the ball's impulse acts on the paddle over the next control step
     ball_dt: float  # s, longest sub-step of the ball's flight
     graph: str = "auto"  # of CUDA for steps and resets on a GPU, of Warp for mjwarp on a CPU: auto, always, never
@@ -179,7 +181,7 @@ class EngineConfig:
 
 @dataclass
 class SimConfig:
-    """What the physics worlds need: a part of every command's configuration."""
+    """Configuration of the physics worlds: a part of every command's configuration."""
 
     robot: RobotConfig
     ball: BallConfig

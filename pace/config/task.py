@@ -13,7 +13,7 @@ from pace.config.sim import SensingConfig, SimConfig
 
 @dataclass
 class ServeConfig:
-    """Where serves start and how fast they are, and when a serve is over."""
+    """Initial position, velocity and spin of serves, and their end."""
 
     name: str
     x: Range  # m
@@ -26,8 +26,8 @@ class ServeConfig:
     max_duration: float  # s since the serve began
     end_after_hit: float  # s after the paddle hit; 0 switches it off
     end_height: float  # m; a ball below it ends the serve
-    serves_per_episode: int  # 0: the worlds play on without end
-    random_phase: bool  # first episodes begin at a random serve, so that resets spread over time
+    serves_per_episode: int  # 0: episodes do not end
+    random_phase: bool  # first episodes begin at a random serve, to desynchronise the resets
     head_start: Range = field(default_factory=lambda: [0.0, 0.0])  # s of its flight that an episode's first serve skips
 
     def __post_init__(self) -> None:
@@ -40,7 +40,7 @@ class ServeConfig:
 
 @dataclass
 class ResetConfig:
-    """Where the robot starts, and where an episode is lost."""
+    """Initial state of the robot, and the bounds that end an episode."""
 
     base_x: Range  # m, world
     base_y: Range  # m, world
@@ -62,7 +62,7 @@ class ResetConfig:
 
 @dataclass
 class RewardTerm:
-    """One term: its weight, multiplied by the control step, the numbers that it needs, and its function.
+    """One term: its weight, multiplied by the control step, its numbers, and its function.
 
     ``function``: name of a term or import path ``my_module:my_term``; null: the term of the same name.
     """
@@ -74,11 +74,11 @@ class RewardTerm:
 
 @dataclass
 class RewardConfig:
-    """The reward: its terms by name, the target that the hit terms share, and the scale that the learner sees."""
+    """The reward: its terms by name, the shared target of the hit terms, and the scale of the learner's reward."""
 
     name: str
-    scale: float  # the learner sees scale * sum of the terms
-    target_x: float  # m; the paddle's target is the apex, or where the ball later passes this x
+    scale: float  # the learner's reward is scale * sum of the terms
+    target_x: float  # m; the paddle's target is the apex, or the later point at which the ball passes this x
     target_mode: str  # "intercept": later of apex and x = target_x; "clamp": apex with its x clamped (released code)
     arm_offset: list[float]  # m; base target = target_xy + arm_offset
     idle_base_xy: list[float]  # m; base target while there is nothing to hit
@@ -96,13 +96,13 @@ class RewardConfig:
 
 @dataclass
 class ReturnMemoryConfig:
-    """What the robot remembers of its own returns (:class:`pace.onboard.returns.ReturnMemory`)."""
+    """Numbers of the memory of returns (:class:`pace.onboard.returns.ReturnMemory`)."""
 
     prior: float  # restitution before the first hit
-    prior_hits: float  # hits that the prior is worth
-    hits: float  # older hits fade once there are that many
-    reach: float  # m; a ball further from the paddle when it is seen to turn was turned by something else
-    closing_speed: float  # m/s along the normal; a slower hit tells nothing
+    prior_hits: float  # weight of the prior, in hits
+    hits: float  # with more hits than this, older ones fade
+    reach: float  # m; a ball that turns farther from the paddle was turned by something else
+    closing_speed: float  # m/s along the normal; slower hits are ignored
     largest: float  # largest single estimate
 
     def __post_init__(self) -> None:
@@ -114,10 +114,10 @@ class ReturnMemoryConfig:
 
 @dataclass
 class DelayEstimateConfig:
-    """How the robot finds out how late its motion capture is (:class:`pace.onboard.delay.DelayEstimate`)."""
+    """Numbers of the estimate of motion capture's delay (:class:`pace.onboard.delay.DelayEstimate`)."""
 
-    prior: float  # s, before anything was seen
-    prior_worth: float  # rad^2/s^2, sum of squared changes of the yaw rate that the prior is worth
+    prior: float  # s, before the first observation
+    prior_worth: float  # rad^2/s^2, weight of the prior, as a sum of squared changes of the yaw rate
     smoothing: float  # share of the filtered turns that is left a control step later
     fading: float  # share of the sums that is left a control step later
 
@@ -131,9 +131,9 @@ class DelayEstimateConfig:
 
 @dataclass
 class AttitudeEstimateConfig:
-    """How the robot knows its orientation better than its sensors (:class:`pace.onboard.attitude.AttitudeEstimate`)."""
+    """Numbers of the orientation filter (:class:`pace.onboard.attitude.AttitudeEstimate`)."""
 
-    gain: float  # share of what is sensed in each control step's estimate; the rest is the last one, turned on
+    gain: float  # share of the sensed value in each control step's estimate; the rest is the rotated last estimate
 
     def __post_init__(self) -> None:
         require(0 < self.gain <= 1, f"observation.attitude_estimate.gain must lie in (0, 1], got {self.gain}")
@@ -141,10 +141,10 @@ class AttitudeEstimateConfig:
 
 @dataclass
 class JointEstimateConfig:
-    """How the robot knows its joints better than its encoders (:class:`pace.onboard.joints.JointEstimate`)."""
+    """Numbers of the joint filter (:class:`pace.onboard.joints.JointEstimate`)."""
 
     acceleration: float  # rad/s^2, root mean square over a control step
-    position_noise: float  # rad, root mean square, of what is sensed
+    position_noise: float  # rad, root mean square, of the sensed positions
     velocity_noise: float  # rad/s, the same
 
     def __post_init__(self) -> None:
@@ -156,7 +156,7 @@ class JointEstimateConfig:
 
 @dataclass
 class ObservationConfig:
-    """Names of the observations of each network, in order, and how many control steps of history each sees."""
+    """Names of the observations of each network, in order, and the control steps of history of each."""
 
     name: str
     policy: list[str]
@@ -180,7 +180,7 @@ class ObservationConfig:
         }
 
     def numbers(self) -> dict[str, Any]:
-        """The same and those from outside, which are dictionaries until they are asked for."""
+        """The same and those from outside, which are dictionaries until they are parsed."""
         return self.estimates | self.built_in()
 
     def __post_init__(self) -> None:
@@ -192,7 +192,7 @@ class ObservationConfig:
 
 @dataclass
 class TaskConfig(SimConfig):
-    """The table-tennis task: the worlds, and what is asked, sensed and rewarded in them."""
+    """The table-tennis task: the worlds, their serves, sensors and rewards."""
 
     serve: ServeConfig
     reset: ResetConfig
@@ -200,7 +200,7 @@ class TaskConfig(SimConfig):
     sensing: SensingConfig
     observation: ObservationConfig
     predictor: PredictorConfig
-    landing_target: list[float]  # m, x and y on the opponent's half where a return should land
+    landing_target: list[float]  # m, x and y: target of returns on the opponent's half
 
     def __post_init__(self) -> None:
         require(len(self.landing_target) == 2, f"landing_target needs two numbers, got {self.landing_target}")

@@ -22,10 +22,10 @@ class SchedulePoint:
 
 @dataclass
 class AlgoConfig:
-    """The learning algorithm: asymmetric PPO, or what an algorithm from outside takes of these numbers."""
+    """The learning algorithm: asymmetric PPO; an algorithm from outside uses those of these numbers that it needs."""
 
     name: str
-    steps: int  # control steps a world plays per update
+    steps: int  # control steps of a world per update
     epochs: int
     minibatches: int
     actor_hidden: list[int]
@@ -45,15 +45,15 @@ class AlgoConfig:
     max_grad_norm: float
     observation_clip: float
     last_layer_gain: float
-    autocast: str  # auto (bf16 where the hardware has it, down to fp32_below), bf16, fp32
+    autocast: str  # auto (bf16 if the hardware supports it, down to fp32_below), bf16, fp32
     later_steps: list[SchedulePoint] = field(default_factory=list)  # in place of steps from that many control steps on
     fp32_below: float = 0.0  # mean std of the policy below which autocast=auto computes in float32
     algorithm: str = "ppo"  # or a class from outside: my_module:MyAlgorithm
-    params: dict[str, float] = field(default_factory=dict)  # numbers that only an algorithm from outside knows
-    observation_norm: bool = True  # by their running mean and spread; off: observations in their own units, clipped
+    params: dict[str, float] = field(default_factory=dict)  # numbers of an algorithm from outside
+    observation_norm: bool = True  # by running mean and std; off: observations in their own units, clipped
 
     def steps_at(self, samples: float) -> int:
-        """Control steps a world plays per update, ``samples`` control steps into the run."""
+        """Control steps of a world per update, ``samples`` control steps into the run."""
         due = [point for point in self.later_steps if point.samples <= samples]
         return int(max(due, key=lambda point: point.samples).value) if due else self.steps
 
@@ -104,7 +104,7 @@ class TrainConfig(TaskConfig):
     samples: float  # control steps in all; whichever of samples and minutes ends first
     minutes: float  # wall-clock; 0: no limit
     out: str | None  # folder of the run; null: runs/<date>_<name>
-    resume: str | None  # a run folder or checkpoint to go on from
+    resume: str | None  # a run folder or checkpoint to resume
     init_from: str | None  # a run folder or checkpoint whose weights to start from
     checkpoint_minutes: float
     tensorboard: bool
@@ -136,7 +136,7 @@ class TrainConfig(TaskConfig):
 def load_train_config(overrides: list[str] | None = None) -> TrainConfig:
     """The training configuration of ``configs/train.yaml`` with Hydra overrides such as ``["num_worlds=64"]``.
 
-    Errors: :class:`ConfigError` for a bad value and for a name that is another one now.
+    Errors: :class:`ConfigError` for a bad value and for a renamed key or choice.
     """
     check_renamed(overrides or [])
     composed = compose("train", overrides)
@@ -144,8 +144,8 @@ def load_train_config(overrides: list[str] | None = None) -> TrainConfig:
     return parse(composed, TrainConfig)
 
 
-# What a resumed run may change; everything else is as it was saved, or the run would not go on where it stopped.
-# Other processes play other worlds, which begin anew.
+# Keys that a resumed run may change; all others are as saved, or the run would not resume exactly.
+# Another number of processes means new worlds.
 RESUME_KEYS = (
     "resume", "samples", "minutes", "checkpoint_minutes", "tensorboard", "progress", "device", "processes", "plugins"
 )  # fmt: skip

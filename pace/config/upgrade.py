@@ -1,8 +1,8 @@
-"""What an older version of pace saved, as this version reads it.
+"""Upgrades of saved configurations and states from older versions of pace.
 
 A checkpoint holds the number of its format. When keys, choices or the saved state change, add a function to
 :data:`CONFIG_UPGRADES` or :data:`STATE_UPGRADES` with the format that it makes, and raise :data:`FORMAT` to that number
-unless it is raised already since the last release. Functions change what they get in place, and run in order.
+unless it was raised already since the last release. Functions change their argument in place, and run in order.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from pace.config.base import to_dict
 from pace.config.predictor import PredictorPriors
 from pace.config.renamed import with_current_names
 
-#: Of what this version writes. 1 is that of version 0.1.0 up to commit 43400ac.
+#: Format that this version writes. 1 is that of version 0.1.0 up to commit 43400ac.
 FORMAT = 2
 
-#: Where a return should land if a saved configuration does not say (released configuration).
+#: Landing target of a saved configuration without one (released configuration).
 LANDING_TARGET = (1.15, 0.0)  # m
 
 Saved = dict[str, Any]
@@ -71,7 +71,7 @@ def store_the_predictors_priors(config: Saved) -> None:
 
 
 def _entry(config: Any, *keys: str) -> Saved:
-    """The dictionary under ``keys``; an empty one that belongs to nobody if there is none."""
+    """The dictionary under ``keys``; a new empty one if there is none."""
     for key in keys:
         config = config.get(key) if isinstance(config, dict) else None
     return config if isinstance(config, dict) else {}
@@ -91,7 +91,7 @@ STATE_UPGRADES: list[Upgrade] = []
 
 
 def upgrade_config(config: Saved, version: int) -> Saved:
-    """A saved configuration of the format ``version``, in the current format; ``config`` stays as it is."""
+    """A saved configuration of the format ``version``, in the current format; ``config`` is not changed."""
     changed = deepcopy(config)
     for _, upgrade in _due(version, CONFIG_UPGRADES):
         upgrade(changed)

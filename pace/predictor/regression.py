@@ -112,8 +112,8 @@ class PredictorTrainer:
         count = valid.sum()
         rows = max(1, self.config.batch_size // self.group.size)
         for _ in range(self._batches):
-            draw = torch.rand(rows, device=valid.device)
-            index = by_validity[(draw * count).long()]
+            uniform = torch.rand(rows, device=valid.device)
+            index = by_validity[(uniform * count).long()]
             error = self.network.scaled(inputs[index]) - self.network.scale_target(targets[index])
             loss = (error.square().mean(1) * valid[index]).mean()  # zero if the rollout had no valid sample
             self.optimiser.zero_grad(set_to_none=True)

@@ -17,7 +17,7 @@ from pace.sim.sensing import Sensing
 from pace.task.game import Game
 from pace.task.resets import ServeSampler
 
-SPREAD_STEPS = 50  # control steps, about as long as a serve
+DESYNCHRONISE_STEPS = 50  # control steps, about as long as a serve
 
 
 STANDING = (-1.8, 0.0, 0.7)  # m, base of a robot that stands still
@@ -69,10 +69,12 @@ class ServePractice:
         control_dt, ball = config.robot.control_dt, self.ball.params
         return Randomizer(config.randomization, config.ball, unused, ball, self.generator, model.nv, control_dt)
 
-    def spread(self) -> None:
+    def desynchronise(self) -> None:
         """Desynchronise the serves, which began together: every rollout then holds all parts of a flight."""
-        first = torch.randint(SPREAD_STEPS, (self.config.num_worlds,), generator=self.generator, device=self.device)
-        for step in range(SPREAD_STEPS):
+        first = torch.randint(
+            DESYNCHRONISE_STEPS, (self.config.num_worlds,), generator=self.generator, device=self.device
+        )
+        for step in range(DESYNCHRONISE_STEPS):
             self.advance(first == step)
 
     @torch.no_grad()

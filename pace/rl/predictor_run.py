@@ -42,7 +42,7 @@ class PredictorRun:
         self.config = config
         self.network = make_predictor(config.predictor).to(device)
         self.practice = ServePractice(config, device)
-        self.practice.spread()
+        self.practice.desynchronise()
         self.trainer = PredictorTrainer(self.network, config.predictor, config.algo.steps, config.num_worlds)
 
     def play(self) -> None:

@@ -166,9 +166,9 @@ class Sensing(Stateful):
 
     def _record(self, robot: RobotState, ball_position: Tensor) -> tuple[MaskedLaunch, MaskedLaunch]:
         """Update and reset."""
-        drawn = {"seed": self._seed, "delays": self._delays, "scales": self._scales, "amplitude": self._amplitude}
+        sampled = {"seed": self._seed, "delays": self._delays, "scales": self._scales, "amplitude": self._amplitude}
         truth = {"robot": robot, "ball_position": ball_position, "nominal": self._nominal}
         kept = {"delay": self._delay, "scale": self._scale, "line": self._line, "sensed": self._sensed}
-        given = drawn | truth | kept
+        given = sampled | truth | kept
         update, reset = (MaskedLaunch(_sense, self._num_worlds, self._device, reset=reset, **given) for reset in (0, 1))
         return update, reset

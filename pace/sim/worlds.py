@@ -262,8 +262,8 @@ class Worlds(Stateful):
 
     def state_tensors(self) -> dict[str, Tensor]:
         """All that the next control step depends on, besides the random generator."""
-        drawn = with_prefix("drawn", self.randomizer.state_tensors())
-        return self._own_tensors() | drawn | with_prefix("engine", self.engine.state_tensors())
+        sampled = with_prefix("drawn", self.randomizer.state_tensors())
+        return self._own_tensors() | sampled | with_prefix("engine", self.engine.state_tensors())
 
     def _own_tensors(self) -> dict[str, Tensor]:
         ball = tensors_named(self.ball, ("position", "velocity", "spin"))

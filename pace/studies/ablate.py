@@ -1,4 +1,4 @@
-"""``python -m pace.studies.ablate``: what each part of the recipe is worth; the same as ``pace ablate``."""
+"""``python -m pace.studies.ablate``: the effect of each part of the recipe; the same as ``pace ablate``."""
 
 import sys
 from functools import partial

@@ -1,6 +1,6 @@
-"""An ablation from its configuration: what each part of the recipe is worth (figure 6 of the paper).
+"""An ablation from its configuration: the effect of each part of the recipe (figure 6 of the paper).
 
-Called again, it skips runs that are finished and resumes those that are not.
+A second call skips finished runs and resumes the others.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from pace.runs.queue import Run, RunQueue, check_settings
 from pace.runs.run_folder import METRICS
 
 DPI = 110
-COLOURS, DASHES = 10, ("-", "--", ":")  # of the figure: the next dash when the colours are used up
-#: Rate of a curve -> factor, unit and decimal places that it is shown with.
+COLOURS, DASHES = 10, ("-", "--", ":")  # of the figure: the next dash after the last colour
+#: Rate of a curve -> factor, unit and decimal places of its display.
 SHOWN_RATES = {"hits": (100.0, "%", 1), "returns": (100.0, "%", 1), "falls": (1.0, "/s", 3)}
-Curves = dict[str, list[Curve]]  # of the seeds that there are, by experiment
+Curves = dict[str, list[Curve]]  # of the available seeds, by experiment
 
 
 class AblationError(RuntimeError):
@@ -33,9 +33,9 @@ class AblationError(RuntimeError):
 
 
 def ablate_from_config(composed: DictConfig) -> None:
-    """Train what is not trained yet, then write CSVs and figure and print the table.
+    """Train the unfinished runs, then write CSVs and figure and print the table.
 
-    Errors: :class:`AblationError`, after all that, when runs failed.
+    Errors: :class:`AblationError`, at the end, if runs failed.
     """
     config = parse(composed, AblateConfig)
     out = Path(config.out)
@@ -69,18 +69,18 @@ def run_name(experiment: str, seed: int) -> str:
 
 
 def short_name(experiment: str) -> str:
-    """Name of an experiment without the folder that it lies in."""
+    """Name of an experiment without its folder."""
     return experiment.rpartition("/")[2]
 
 
 def train(config: AblateConfig, out: Path) -> Mapping[str, str]:
-    """Play the runs and write their CSVs into ``out``; returns the reasons of those that failed."""
+    """Train the runs and write their CSVs into ``out``; returns the reasons of those that failed."""
     runs = [check_settings(run) for run in planned_runs(config)]
     queue = RunQueue(runs, config.jobs, config.progress)
     try:
         queue.play()
     except KeyboardInterrupt:
-        print(f"\nto go on: the same command; finished and saved runs are in {config.out}", file=sys.stderr)
+        print(f"\nto resume: the same command; finished and saved runs are in {config.out}", file=sys.stderr)
         raise
     out.mkdir(parents=True, exist_ok=True)
     for run in runs:
@@ -90,7 +90,7 @@ def train(config: AblateConfig, out: Path) -> Mapping[str, str]:
 
 
 def read_curves(config: AblateConfig, out: Path) -> Curves:
-    """Curves of the CSVs in ``out``. Errors: :class:`AblationError` when there is none."""
+    """Curves of the CSVs in ``out``. Errors: :class:`AblationError` if there is none."""
     files = {name: [out / f"{run_name(name, seed)}.csv" for seed in config.seeds] for name in config.experiments}
     curves = {
         name: [read_curve(file, config.window) for file in there if file.exists()] for name, there in files.items()
@@ -102,8 +102,8 @@ def read_curves(config: AblateConfig, out: Path) -> Curves:
 
 
 def summary(curves: Curves) -> str:
-    """A row for each experiment: what it needs for each milestone that one of them reaches, its rates at the last
-    control step that all runs have got to, and its speed."""
+    """A row for each experiment: the control steps to each milestone that one of them reaches, its rates at the last
+    control step that all runs have reached, and its speed."""
     runs = [curve for seeds in curves.values() for curve in seeds]
     reached = [milestone for milestone in MILESTONES if any(passage(curve, milestone) for curve in runs)]
     end = min((curve.samples[-1] for curve in runs if len(curve.samples)), default=0.0)
@@ -138,7 +138,7 @@ def at_end(seeds: Sequence[Curve], rate: str, end: float) -> str:
 def needed(seeds: Sequence[Curve], milestone: Milestone) -> str:
     """Median and range over ``seeds`` of the millions of control steps to ``milestone``.
 
-    A seed that does not get there counts as one that needs more than all others.
+    A seed that does not reach it counts as slower than all others.
     """
     found = [passage(curve, milestone) for curve in seeds]
     reached = sorted(place.samples / 1e6 for place in found if place is not None)
@@ -175,7 +175,7 @@ def _draw_experiment(axes: Axes, number: int, name: str, seeds: Sequence[Curve],
 
 
 def over_seeds(seeds: Sequence[Curve], rate: str) -> tuple[Array, Array]:
-    """Control steps (M,) that all ``seeds`` have got to, and their ``rate`` (S, M) there, interpolated."""
+    """Control steps (M,) that all ``seeds`` have reached, and their ``rate`` (S, M) there, interpolated."""
     end = min((curve.samples[-1] for curve in seeds if len(curve.samples)), default=0.0)
     samples = np.unique(np.concatenate([curve.samples for curve in seeds]))
     samples = samples[samples <= end]

@@ -1,4 +1,4 @@
-"""Whether a policy finds out what paddle it plays with: success by the serve, on paddles that it has not met."""
+"""Adaptation of a policy to its paddle: success by the serve, on unknown paddles."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from pace.task.env import TableTennisEnv
 from pace.task.observations import POLICY, layout
 from pace.task.outcome import Outcome
 
-HIT_SPEED = 6.0  # m/s along the normal, at which paddles are told apart
+HIT_SPEED = 6.0  # m/s along the normal, at which restitutions are compared
 #: Restitution at HIT_SPEED below which a paddle belongs to the group; randomization=wide goes from 0.38 to 0.87.
 GROUPS = {"dead": 0.54, "middling": 0.71, "lively": 1.0}
 SERVES = 8
@@ -37,7 +37,7 @@ class Adaptation:
 
 
 class Forgetful:
-    """A policy that sees, in place of its memory, what it sees before the first return: zeros."""
+    """A policy whose memory is replaced by its value before the first return: zeros."""
 
     def __init__(self, policy: TaskPolicy) -> None:
         names, frames = policy.config.observation.policy, policy.config.observation.policy_history
@@ -51,7 +51,7 @@ class Forgetful:
 
 
 def adapt(run: Path, worlds: int, forgetful: bool = False) -> Adaptation:
-    """Play the first ``SERVES`` mixed serves of ``worlds`` robots, each with a paddle and a ball of its own.
+    """Play the first ``SERVES`` mixed serves of ``worlds`` robots, each with a different paddle and ball.
 
     ``forgetful``: with the memory blanked (of a policy that has ``last_return``).
     """
@@ -61,7 +61,7 @@ def adapt(run: Path, worlds: int, forgetful: bool = False) -> Adaptation:
     recorder = ServeRecorder(env, 0, SERVES)
     play(env, Forgetful(policy) if forgetful else policy, recorder)  # type: ignore[arg-type]  # only called
     records = recorder.records[:-1].view(worlds, SERVES, len(COLUMNS))
-    stood = (records[..., C["fall"]] == 0).all(1)  # a fall draws a new paddle
+    stood = (records[..., C["fall"]] == 0).all(1)  # after a fall the paddle is resampled
     success = records[..., C["outcome"]] == Outcome.SUCCESS
     name = f"{run.name}, memory blanked" if forgetful else run.name
     return Adaptation(name, success[stood], restitution[stood])
@@ -74,7 +74,7 @@ def _restitution(env: TableTennisEnv) -> Tensor:
 
 
 def adaptations(runs: Sequence[Path], worlds: int) -> list[Adaptation]:
-    """Every policy, and those with a memory without it too."""
+    """Every policy, and each one that has a memory also without it."""
     found = []
     for run in runs:
         remembers = "last_return" in load_policy(run).config.observation.policy
@@ -95,7 +95,7 @@ def groups(found: Adaptation) -> dict[str, Tensor]:
 
 
 def table(found: Sequence[Adaptation]) -> str:
-    """One row a policy and group of paddles: success (%) of each serve, with the half width of its 95 % interval."""
+    """One row per policy and group of paddles: success (%) of each serve, with the half width of its 95 % interval."""
     rows = []
     for adaptation in found:
         for name, success in groups(adaptation).items():

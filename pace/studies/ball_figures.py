@@ -1,4 +1,4 @@
-"""The ball against independent solutions: the figures of ``docs/results/physics.md`` and the numbers it quotes."""
+"""The ball against independent solutions: the figures and numbers of ``docs/results/physics.md``."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def _strike(slip: wp.array[wp.float32], friction: float, velocity: wp.array[wp.v
 
 
 def draw_rebound(figure: Figure) -> None:
-    """What a rebound leaves of the tangential speed, and the spin that it gives: kernel (dots) and closed form."""
+    """Share of the tangential speed left after a rebound, and the spin that it gives: kernel (dots) and closed form."""
     slip = np.linspace(0.05, 8.0, 60)
     kept, turned = figure.subplots(1, 2)
     for friction, colour in zip((0.1, 0.25, 0.38, 0.6), COLOURS, strict=False):
@@ -156,7 +156,7 @@ def draw_presets(figure: Figure) -> None:
 
 
 def print_presets() -> None:
-    """A table of what the presets do to one serve, and to a ball that meets a resting paddle at 5 m/s."""
+    """A table of one serve, and of a ball that hits a resting paddle at 5 m/s, with each preset."""
     print("\npreset: bounce time (s), bounce x, apex x, apex z (m), apex time (s); speed off a resting paddle (m/s)")
     for preset in PRESETS:
         sim = make_sim(1, BallParams.preset(preset))
@@ -171,23 +171,21 @@ def print_presets() -> None:
 
 
 def print_checks() -> None:
-    """Strikes in other frames and phases, drag found back, and the forecast held against the flight."""
+    """Strikes in other frames and phases, identified drag, and the forecast compared with the flight."""
     print("\nstrikes by a swinging paddle seen from another frame: change of the velocity over the speed; of the spin")
     for velocity, yaw in (((5.0, -3.0, 4.0), 0.0), ((0.0, 0.0, 0.0), 1.1), ((-9.0, 6.0, 0.0), -2.0)):
         share, spin = frame_difference(velocity, yaw)
         print(f"moving at {velocity} m/s, turned by {yaw} rad: {share:.1e}, {spin:.2f} rad/s")
-    print(
-        "100 strikes, each at 20 phases of a control step: largest spread of the velocity over the speed; of the spin"
-    )
+    print("100 strikes, each at 20 phases of a control step: largest range of the velocity over the speed; of the spin")
     for substeps in (2, 4, 10):
         share, spin = phase_spread(substeps)
         largest, median = share.max(), np.median(share)
         print(f"path known every {20 / substeps:g} ms: {largest:.1e} (median {median:.1e}), {spin.max():.2f} rad/s")
-    print("drag found back from 22 flights of 20 frames (paper's ball)")
+    print("drag identified from 22 flights of 20 frames (paper's ball)")
     for noise in (0.0, 0.001):
         error = fitted_drag(recorded_flights(22, 20, noise)) / true_drag("paper") - 1
         print(f"noise {1e3 * noise:g} mm: k off by {100 * error:+.3f} %")
-    print("forecast against flight, 300 returns: largest error of the landing's time and place")
+    print("forecast against flight, 300 returns: largest error of the landing's time and position")
     for preset in PRESETS:
         times, places = forecast_errors(preset)
         print(f"{preset}: {1e6 * times.max():.0f} μs, {1e3 * places.max():.3f} mm")
@@ -220,7 +218,7 @@ def print_speed(num_worlds: int = 1024) -> None:
 
 
 def validate_from_config(composed: DictConfig) -> None:
-    """Draw the figures into the folder that the composed configuration names, and print the numbers."""
+    """Draw the figures into the configured folder, and print the numbers."""
     config = parse(composed, ValidateConfig)
     out = Path(config.out) if config.out else default_folder("validate")
     out.mkdir(parents=True, exist_ok=True)

@@ -1,8 +1,7 @@
-"""Independent solutions that the ball's kernels are held against: NumPy in double precision, SciPy (extra ``dev``).
+"""Independent reference solutions for the ball's kernels: NumPy in double precision, SciPy (extra ``dev``).
 
-Nothing here shares code with the kernels. A batch of flights is one system of equations for DOP853 at 1e-10. Each
-flight runs in its own time, scaled to [0, 1], and an event is found by Newton's method on its duration, so that no
-interpolation takes part.
+This module shares no code with the kernels. A batch of flights is one system of equations for DOP853 at 1e-10. The time
+of each flight is scaled to [0, 1], and an event is found by Newton's method on its duration, without interpolation.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from scipy.integrate import solve_ivp
 
 T = TypeVar("T")
 Array = NDArray[np.float64]
-#: Value and rate of what is to become zero, from position and velocity (N, 3).
+#: Value and rate of an event's function, from position and velocity (N, 3).
 Condition = Callable[[Array, Array], tuple[Array, Array]]
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
@@ -65,7 +64,7 @@ def fly_for(ball: ReferenceBall, position: Array, velocity: Array, spin: Array, 
 def fly_until(
     ball: ReferenceBall, position: Array, velocity: Array, spin: Array, condition: Condition, guess: Array
 ) -> tuple[Array, Array, Array]:
-    """Duration (N,), position and velocity (N, 3) where ``condition`` is zero, by Newton's method from ``guess`` s."""
+    """Duration (N,), position and velocity (N, 3) at the zero of ``condition``, by Newton's method from ``guess`` s."""
     duration = guess.copy()
     for _ in range(20):
         end_position, end_velocity = fly_for(ball, position, velocity, spin, duration)
@@ -87,8 +86,8 @@ def rebound(
 ) -> tuple[Array, Array]:
     """Velocity and spin (N, 3) of approaching hollow spheres after an impulse, from the balance of momentum.
 
-    Per unit of mass: the normal impulse reverses the approach with ``restitution``; the friction impulse is what stops
-    the slip of the contact, or ``friction`` times the normal impulse where that is less.
+    Per unit of mass: the normal impulse reverses the approach with ``restitution``; the friction impulse stops the slip
+    of the contact, and is at most ``friction`` times the normal impulse.
     """
     inertia = 2.0 / 3.0 * radius**2
     arm = -radius[:, None] * normal
@@ -106,7 +105,7 @@ def rebound(
 
 @dataclass(frozen=True)
 class ReferenceServe:
-    """A serve up to its apex after one bounce on the table's top, seen as an endless plane; (N, ...) arrays."""
+    """A serve up to its apex after one bounce on the table's top, taken as an infinite plane; (N, ...) arrays."""
 
     bounce_time: Array  # s
     bounce: Array  # m, centre
@@ -118,7 +117,7 @@ class ReferenceServe:
 def fly_serve(
     ball: ReferenceBall, position: Array, velocity: Array, spin: Array, table_height: float
 ) -> ReferenceServe:
-    """Fly serves that come down on the table to the apex behind it."""
+    """Fly serves to the apex after their bounce on the table."""
     height = position[:, 2] - table_height - ball.radius
     rise = velocity[:, 2]
     ballistic = (rise + np.sqrt(rise**2 - 2.0 * GRAVITY[2] * height)) / -GRAVITY[2]
@@ -176,10 +175,10 @@ def random_serves(count: int, seed: int = 0) -> ServeBatch:
     Spin up to 150 rad/s on each axis, and each serve its own parameters. Inputs are exact in float32.
     """
     rng = np.random.default_rng(seed)
-    draws = count + count // 2 + 10
+    samples = count + count // 2 + 10
 
     def uniform(low: float, high: float, *shape: int) -> Array:
-        return rng.uniform(low, high, (draws, *shape)).astype(np.float32).astype(np.float64)
+        return rng.uniform(low, high, (samples, *shape)).astype(np.float32).astype(np.float64)
 
     ball = _random_ball(uniform)
     position = np.stack([uniform(1.2, 1.5), uniform(-0.2, 0.2), uniform(0.95, 1.15)], axis=1)
@@ -194,5 +193,5 @@ def random_serves(count: int, seed: int = 0) -> ServeBatch:
     inside = (flight.bounce[:, 0] < -0.05) & (flight.bounce[:, 0] > -1.35) & (np.abs(flight.bounce[:, 1]) < 0.75)
     chosen = np.flatnonzero(inside & (crossing[:, 2] > 0.9125 + 0.04))[:count]
     if len(chosen) < count:
-        raise RuntimeError(f"only {len(chosen)} of {draws} random serves are good, {count} were asked for")
+        raise RuntimeError(f"only {len(chosen)} of {samples} random serves are usable, {count} were requested")
     return ServeBatch(_rows(ball, chosen), position[chosen], velocity[chosen], spin[chosen], _rows(flight, chosen))

@@ -1,6 +1,6 @@
-"""The studies by name: engines against each other, step sizes, solver settings, paddle reaction, motors, what a
-predictor can know, how a policy stands, whether it finds out its paddle, what it makes of its sensors, what bf16
-rounding does to its learning, the curves of the recipes that were tried, and the rooms of the package.
+"""The studies by name: engine parity, step sizes, solver settings, paddle reaction, motors, predictors and their error
+bounds, posture, adaptation to the paddle, on-board estimates, bf16 rounding in the update, the learning curves of the
+recipes that were tried, and the rooms of the package.
 
 They print the tables of the pages in ``docs/results`` and draw their figures.
 """
@@ -39,7 +39,7 @@ RESULTS = Path("docs/results")
 
 @dataclass(frozen=True)
 class Options:
-    """What a study looks at, and how much of it; see configs/studies.yaml."""
+    """Subject and size of a study; see configs/studies.yaml."""
 
     worlds: int
     serves: int
@@ -111,7 +111,7 @@ def _policies(options: Options) -> list[Path]:
 
 def study_predictor(options: Options) -> None:
     for run in options.predictors:
-        load_predictor(run)  # wrong ones are told before minutes of bounds
+        load_predictor(run)  # wrong ones raise before minutes of computing bounds
     found = []
     for case in options.cases or predictor.CASES:
         found.append(predictor.compare(case, options.serves, options.predictors))
@@ -157,9 +157,9 @@ STUDIES = {
 
 
 def study_from_config(composed: DictConfig) -> None:
-    """Do the studies that the composed configuration names.
+    """Run the configured studies.
 
-    Errors: :class:`ConfigError` for a name that is not there; :class:`pace.runs.checkpoint.CheckpointError`.
+    Errors: :class:`ConfigError` for an unknown name; :class:`pace.runs.checkpoint.CheckpointError`.
     """
     config = parse(composed, StudiesConfig)
     names = list(STUDIES) if config.studies == ["all"] else config.studies

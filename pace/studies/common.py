@@ -1,4 +1,4 @@
-"""What the studies share: configuration, robots on an engine, and tables."""
+"""Common parts of the studies: configuration, robots on an engine, and tables."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from pace.sim.worlds import Worlds
 
 Array = NDArray[np.float64]
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")  # told apart by all kinds of vision
-#: The task of a saved policy that is watched: mixed serves without end, from the paper's reset, at 2 ms on one thread.
+#: Overrides of a saved policy's task: mixed serves without episode ends, the paper's reset, 2 ms, one thread.
 ENDLESS = (
     "reset=evaluation", "serve=mixed", "serve.serves_per_episode=0", "serve.end_after_hit=0",
     "engine=native", "engine.threads=1", "engine.physics_dt=0.002",
@@ -35,7 +35,7 @@ def _clean_config() -> TrainConfig:
 
 
 def study_spec() -> RobotSpec:
-    """The parts of the robot that the studies without a policy take: the default one."""
+    """The parts of the default robot, for studies without a policy."""
     return RobotSpec.of(_clean_config().robot)
 
 
@@ -74,8 +74,8 @@ def smooth_swings(nominal: Tensor, num_worlds: int, steps: int, seed: int, arm: 
     """
     generator = torch.Generator().manual_seed(seed)
     joints = nominal.shape[0]
-    draw = torch.rand(3, 3, num_worlds, joints, generator=generator)
-    phase, frequency, share = 2 * np.pi * draw[0], 0.5 + 2.0 * draw[1], draw[2]
+    uniform = torch.rand(3, 3, num_worlds, joints, generator=generator)
+    phase, frequency, share = 2 * np.pi * uniform[0], 0.5 + 2.0 * uniform[1], uniform[2]
     time = 0.02 * torch.arange(steps).view(-1, 1, 1, 1)
     wave = (share * torch.sin(2 * np.pi * frequency * time + phase)).sum(1)
     amplitude = torch.full((joints,), rest)

@@ -1,4 +1,4 @@
-"""Serves as points of a unit cube: what the task draws for a serve, and what the robot would sense of its flight."""
+"""Serves as points of a unit cube: the sampled quantities of a serve, and the sensed positions of its flight."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from pace.sim.ball.ball import BallParams, BallSim
 from pace.sim.randomization import BALL_LIMITS, SAMPLED_BALL_PARAMS
 
 AXES = ("x", "y", "z")
-FAR_AWAY = 100.0  # m, where the paddle is
+FAR_AWAY = 100.0  # m, position of the paddle
 
 
 class ServePrior:
-    """The uniform distributions from which a serve, its ball and its sensors are drawn, without those of no width.
+    """The uniform distributions of a serve, its ball and its sensors, without those of zero width.
 
     ``names`` (D): position, velocity and spin of the launch by axis (m, m/s, rad/s), ball parameters by name, and
     ``delay`` in control steps. ``low``, ``width`` (D,).
     """
 
     def __init__(self, config: TrainConfig) -> None:
-        serve, draws, ball = config.serve, config.randomization, config.ball
+        serve, randomization, ball = config.serve, config.randomization, config.ball
         ranges = {f"position_{axis}": getattr(serve, axis) for axis in AXES}
         ranges |= {f"velocity_{axis}": getattr(serve, f"v{axis}") for axis in AXES}
         ranges |= {f"spin_{axis}": serve.spin for axis in AXES}
         for name, (range_name, scales) in SAMPLED_BALL_PARAMS.items():
-            nominal, (low, high) = float(getattr(ball, name)), getattr(draws, range_name)
+            nominal, (low, high) = float(getattr(ball, name)), getattr(randomization, range_name)
             ranges[name] = [nominal * low, nominal * high] if scales else [nominal + low, nominal + high]
         ranges["delay"] = [bound / config.robot.control_dt for bound in config.sensing.mocap_delay]
         self.fixed = {name: low for name, (low, high) in ranges.items() if high <= low}
@@ -38,23 +38,23 @@ class ServePrior:
         self.width = torch.tensor([ranges[name][1] - ranges[name][0] for name in self.names])
 
     def values(self, cube: Tensor) -> dict[str, Tensor]:
-        """Points (M, D) of the unit cube -> every drawn quantity (M,) by name."""
-        drawn = self.low + self.width * cube
+        """Points (M, D) of the unit cube -> every sampled quantity (M,) by name."""
+        sampled = self.low + self.width * cube
         found = {name: torch.full((len(cube),), value) for name, value in self.fixed.items()}
-        found |= {name: drawn[:, i] for i, name in enumerate(self.names)}
+        found |= {name: sampled[:, i] for i, name in enumerate(self.names)}
         for name, (low, high) in BALL_LIMITS.items():
             if name in found:
                 found[name] = found[name].clamp(low, high)
         return found
 
     def cube(self, values: dict[str, Tensor]) -> Tensor:
-        """Inverse of :meth:`values`, (M, D); where a limit cuts a draw, one of the points that give it."""
-        drawn = torch.stack([values[name] for name in self.names], dim=1)
-        return ((drawn - self.low) / self.width).clamp(0.0, 1.0)
+        """Inverse of :meth:`values`, (M, D); if a limit clamps a sample, one of the points that give it."""
+        sampled = torch.stack([values[name] for name in self.names], dim=1)
+        return ((sampled - self.low) / self.width).clamp(0.0, 1.0)
 
 
 class FlightModel:
-    """Flies M serves as the task does, with the simulation's own ball; no robot, no noise."""
+    """Flies M serves as the task does, with the simulation's ball; no robot, no noise."""
 
     def __init__(self, config: TrainConfig, count: int) -> None:
         self.prior, self.config = ServePrior(config), config
@@ -75,7 +75,7 @@ class FlightModel:
         return delayed(torch.stack(flight, dim=1), values["delay"])
 
     def apex(self, cube: Tensor) -> Tensor:
-        """Apex (M, 3) m after the bounce, NaN where there is none, for points (M, D)."""
+        """Apex (M, 3) m after the bounce, NaN if there is none, for points (M, D)."""
         self._launch(cube)
         ball = self._ball
         ball.forecast(self._everyone, ball.position, ball.velocity, ball.spin, self.config.reward.target_x)
@@ -92,7 +92,7 @@ class FlightModel:
 
 
 def delayed(flight: Tensor, delay: Tensor) -> Tensor:
-    """Positions (M, T, 3) as seen ``delay`` (M,) control steps late, linear between frames; the first has no past."""
+    """Positions (M, T, 3) delayed by ``delay`` (M,) control steps, linear between frames; the first has no past."""
     whole = delay.floor()
     share = (delay - whole).view(-1, 1, 1)
     now = torch.arange(flight.shape[1]) - whole.long().unsqueeze(1)
@@ -102,11 +102,11 @@ def delayed(flight: Tensor, delay: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Recording:
-    """N serves of the task over T control steps from their launch, as :class:`ServePractice` plays and senses them."""
+    """N serves of the task over T control steps from their launch, from :class:`ServePractice`."""
 
-    cube: Tensor  # (N, D), what was drawn
+    cube: Tensor  # (N, D), the samples
     sensed: Tensor  # (N, T, 3) m
-    predicted: Tensor  # (N, T, 3) m, apex that a predictor gave; NaN without one
+    predicted: Tensor  # (N, T, 3) m, predicted apex; NaN without a predictor
     apex: Tensor  # (N, 3) m
     time_to_apex: Tensor  # (N, T) s
     valid: Tensor  # (N, T) bool, there is something to hit
@@ -114,7 +114,7 @@ class Recording:
 
 @torch.no_grad()
 def record(config: TrainConfig, frames: int, predictor: nn.Module | None = None) -> Recording:
-    """Play ``config.num_worlds`` serves for ``frames`` control steps; ``predictor`` follows them.
+    """Play ``config.num_worlds`` serves for ``frames`` control steps; ``predictor`` predicts at each.
 
     The same seed gives the same serves to every predictor.
     """
@@ -136,9 +136,9 @@ def record(config: TrainConfig, frames: int, predictor: nn.Module | None = None)
 
 
 def _drawn(practice: ServePractice) -> dict[str, Tensor]:
-    """What was drawn for the serves that have just begun, by the names of :class:`ServePrior`."""
+    """The samples of the serves that have just begun, by the names of :class:`ServePrior`."""
     ball = practice.ball
     launch = {"position": ball.position, "velocity": ball.velocity, "spin": ball.spin}
-    drawn = {f"{name}_{axis}": value[:, i].clone() for name, value in launch.items() for i, axis in enumerate(AXES)}
-    drawn |= {name: getattr(ball.params, name).clone() for name in SAMPLED_BALL_PARAMS}
-    return drawn | {"delay": practice.sensing.delay.clone()}
+    sampled = {f"{name}_{axis}": value[:, i].clone() for name, value in launch.items() for i, axis in enumerate(AXES)}
+    sampled |= {name: getattr(ball.params, name).clone() for name in SAMPLED_BALL_PARAMS}
+    return sampled | {"delay": practice.sensing.delay.clone()}

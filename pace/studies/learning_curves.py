@@ -1,4 +1,4 @@
-"""The learning curves of ``docs/results/learning.md``: the default recipe of the time, and the prototype before it.
+"""The learning curves of ``docs/results/learning.md``: the default recipe at that time, and the earlier prototype.
 
 Reads ``recipe/return_velocity_seed*.csv`` and ``learning/prototype.csv`` of a folder of results.
 """

@@ -1,4 +1,4 @@
-"""The motors' torque-speed limit: what a policy asks of its motors without it and with it, and what a step costs."""
+"""The motors' torque-speed limit: a policy's use of its motors without it and with it, and the cost of a step."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from pace.sim.robot_spec import RobotSpec
 from pace.studies.common import ENDLESS, Array, model_of, study_config, study_spec
 from pace.task.env import TableTennisEnv
 
-ROBOT = "robot=t1"  # the limit is of configs/, not of a policy that was trained before it
+ROBOT = "robot=t1"  # the limit is that of configs/, not that of an older policy
 WITHOUT, WITH = "without", "with"
 CASES = {WITHOUT: [ROBOT, "robot.stall_ratio=0"], WITH: [ROBOT]}
 #: Groups of motors, the first match counts.
@@ -37,11 +37,11 @@ COST_STEPS = 10
 
 
 class MotorRecorder(ServeRecorder):
-    """What becomes of the serves, and how the motors are used: counts of instants, by joint.
+    """Outcomes of the serves, and use of the motors: counts of instants, by joint.
 
     Attributes: ``instants``; ``fast`` (J,): speed over the motor's greatest; ``over`` (J,): torque over the line of
-    its world (in the last physics step of a control step, like ``joint_torque``); ``held`` (J,): torque at what line
-    and effort allow, or over it; ``fastest`` (J,): largest speed, of the motor's greatest; ``excess`` (J,): largest
+    its world (in the last physics step of a control step, like ``joint_torque``); ``held`` (J,): torque at or over the
+    limit of line and effort; ``fastest`` (J,): largest speed, of the motor's greatest; ``excess`` (J,): largest
     torque over the line, of the effort.
     """
 
@@ -114,8 +114,8 @@ def uses(runs: Sequence[Path], worlds: int, serves: int) -> list[Use]:
 
 
 def table(found: Sequence[Use]) -> str:
-    """One column a play: its serves, then for each group of motors the time (%) beyond its speed, beyond its line and
-    at what it can give, the largest speed, and the largest torque over the line."""
+    """One column per evaluation: its serves, then for each group of motors the time (%) beyond its speed, beyond its
+    line and at its limit, the largest speed, and the largest torque over the line."""
     header = ["", *(f"{Path(use.policy).name}, {use.case}" for use in found)]
     rows = [[f"hit, success (%) of {found[0].serves} serves"]]
     rows[0] += [f"{100 * use.hit:.1f}, {100 * use.success:.1f}" for use in found]

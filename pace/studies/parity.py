@@ -1,11 +1,11 @@
 """The two engines over one second of the same random targets from the same states: standing, falling, striking.
 
-Motion on a rigid floor is chaotic: a contact made a step earlier sets two robots apart. So the difference of the
-engines stands beside that of MuJoCo with itself, started 1 urad beside. Where trunk (box) or paddle (cylinder) touch
-table or body, the engines use different algorithms and may find other points; such worlds are listed apart.
+Motion on a rigid floor is chaotic: one contact a step earlier separates two robots. So the difference of the engines is
+compared with that of MuJoCo with itself, started 1 urad off. If trunk (box) or paddle (cylinder) touch table or body,
+the engines use different algorithms and may find other points; such worlds are listed separately.
 
-A pyramidal friction cone depends on the contact's axes, and MuJoCo Warp turns those of a steep capsule on the floor
-differently (its plane_capsule has a fixed axis where the capsule stands above 60 degrees; MuJoCo always the capsule's).
+A pyramidal friction cone depends on the contact's axes, and MuJoCo Warp chooses those of a steep capsule on the floor
+differently (its plane_capsule has a fixed axis if the capsule stands above 60 degrees; MuJoCo always the capsule's).
 An elliptic cone does not depend on them: with it, falls on limbs alone agree too.
 """
 
@@ -30,13 +30,13 @@ INSTANTS = (5, 10, 25, 50)  # control steps after which differences are quoted
 THROWS = (10, 22, 34, 46)  # control steps before which a ball is thrown at the paddle
 NUDGE = 1e-6  # rad
 SEED = 11
-#: What is compared with ``native``.
+#: Engine and initial offset of each comparison with ``native``.
 OTHERS = {"mjwarp": ("mjwarp", 0.0), "native, 1 μrad beside": ("native", NUDGE)}
 
 #: Bodies (a box, a cylinder) whose contacts are found by a general convex algorithm.
 CONVEX_BODIES = ("trunk", "paddle")
 
-#: Falls without anything in which the engines are known to differ.
+#: Falls without the known differences of the engines.
 LIMBS_ELLIPTIC = "falling, limbs only, elliptic cone"
 
 Balls = list[tuple[Tensor, Tensor]]
@@ -51,12 +51,12 @@ class Play:
     load: Array  # (T, N, 2) N, vertical force on the feet
     paddle: Array  # (T, N, 12)
     ball: Array  # (T, N, 3) m/s
-    touched: Array  # (T, N) 1 where trunk or paddle touched anything at the end of a control step
+    touched: Array  # (T, N) 1 if trunk or paddle touched anything at the end of a control step
 
 
 @dataclass(frozen=True)
 class Difference:
-    """How far two plays are apart, (T, N)."""
+    """Difference of two rollouts, (T, N)."""
 
     joints: Array  # rad, largest of all joints
     base: Array  # m
@@ -79,7 +79,7 @@ class Scenario:
     velocity: Tensor
     targets: Tensor
     strikes: bool = False
-    convex: bool = True  # CONVEX_BODIES touch what they meet; otherwise they pass through it
+    convex: bool = True  # CONVEX_BODIES collide; otherwise they pass through everything
     cone: str = "pyramidal"
 
 
@@ -102,9 +102,9 @@ def scenarios(num_worlds: int, nominal: Tensor) -> dict[str, Scenario]:
 
 
 def limbs_only(model: mujoco.MjModel) -> mujoco.MjModel:
-    """The model with the contacts of CONVEX_BODIES taken away: their pairs become floor and table, which never touch.
+    """The model without the contacts of CONVEX_BODIES: their pairs become floor and table, which never touch.
 
-    A negative margin would not do: MuJoCo's sphere and cylinder keep a contact without force, which sensors count.
+    A negative margin would not work: MuJoCo's sphere and cylinder keep a contact without force, which sensors count.
     """
     geoms = [model.geom(body).id for body in CONVEX_BODIES]
     pairs = np.isin(model.pair_geom1, geoms) | np.isin(model.pair_geom2, geoms)
@@ -113,7 +113,7 @@ def limbs_only(model: mujoco.MjModel) -> mujoco.MjModel:
 
 
 def play(engine: str, nudge: float, scenario: Scenario, balls: Balls) -> Play:
-    """Play a scenario. ``balls``: what was thrown; the first play, which finds it empty, aims and fills it."""
+    """Roll out a scenario. ``balls``: the throws; the first rollout, which finds it empty, aims and fills it."""
     config = study_config(name=engine, cone=scenario.cone)
     count = scenario.velocity.shape[0]
     everyone = torch.ones(count, dtype=torch.bool)
@@ -147,7 +147,7 @@ def _look(worlds: Worlds) -> tuple[Array, ...]:
 
 
 def difference(one: Play, other: Play) -> Difference:
-    """How far two plays of the same scenario are apart."""
+    """Difference of two rollouts of the same scenario."""
     ahead, behind = (np.linalg.norm(one.base[..., 3:] + sign * other.base[..., 3:], axis=2) for sign in (-1, 1))
     return Difference(
         joints=np.abs(one.joints - other.joints).max(axis=2),
@@ -197,7 +197,7 @@ def _row(name: str, d: Difference) -> list[str]:
 
 
 def strike_table(found: dict[str, dict[str, Difference]]) -> str:
-    """The ball after each strike and the paddle then: median and largest of the worlds."""
+    """The ball after each strike and the paddle at that time: median and largest of the worlds."""
     strikes = [f"ball (m/s) after strike {n}" for n in range(1, len(THROWS) + 1)]
     rows = []
     for other, d in found["striking"].items():

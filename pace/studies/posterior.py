@@ -1,9 +1,9 @@
-"""The best that can be known of an apex: the mean of all serves that explain what was sensed of one.
+"""The optimal estimate of an apex: the posterior mean over all serves that are consistent with the sensed positions.
 
 The posterior is sampled by Metropolis chains over :class:`pace.studies.flights.FlightModel`. Every distribution of the
-task is uniform, so a point of the prior's cube is possible when every sensed position lies within the noise of where
-its flight would be seen, and all possible points are equally likely. Chains begin at what was really drawn, which is
-itself one draw from the posterior, and forget it in the first part of the way.
+task is uniform. So a point of the prior's cube is possible if every sensed position lies within the noise around its
+flight, and all possible points are equally likely. Chains begin at the true sample, which is itself a sample from the
+posterior, and forget it in their burn-in.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from torch import Tensor
 from pace.config.training import TrainConfig
 from pace.studies.flights import FlightModel
 
-SMALLEST_NOISE = 1e-4  # m: a clean position is taken as known to this
+SMALLEST_NOISE = 1e-4  # m: assumed noise of a clean position
 ROUNDING = 2e-5  # m, of float32 flights
 STEP = 0.02  # of the cube, for the slopes of a flight
 LARGEST_MOVE, SHARE_MOVED = 1.5, 0.3  # of a deviation; of the axes
-APEX_EVERY = 4  # steps between the looks at a chain's apex
+APEX_EVERY = 4  # steps between samples of a chain's apex
 
 
 @dataclass(frozen=True)
 class Question:
-    """Q times: a serve was seen up to a control step. What is its apex?"""
+    """Q questions: the apex of a serve that was sensed up to a control step."""
 
     cube: Tensor  # (Q, D) the truth
     sensed: Tensor  # (Q, T, 3) m
@@ -38,14 +38,14 @@ class Question:
 
 @dataclass(frozen=True)
 class Answer:
-    """Posterior of the apex of each question: mean (Q, 3) m, and ``spread`` (Q,) m, root of its variance in 3-D."""
+    """Posterior of the apex of each question: mean (Q, 3) m, and ``std`` (Q,) m, root of its variance in 3-D."""
 
     mean: Tensor
-    spread: Tensor
+    std: Tensor
 
 
 def proposal(model: FlightModel, question: Question, noise: float) -> Tensor:
-    """(Q, D, D) columns: axes of the posterior's ellipsoid, as long as its deviations, were flights linear."""
+    """(Q, D, D) columns: axes of the posterior's ellipsoid, as long as its standard deviations, for linear flights."""
     dims = question.cube.shape[1]
     slopes = []
     for d in range(dims):
@@ -60,10 +60,10 @@ def proposal(model: FlightModel, question: Question, noise: float) -> Tensor:
 
 
 def answer(config: TrainConfig, question: Question, chains: int, steps: int, seed: int = 1) -> Answer:
-    """Posterior mean and spread of the apex, from ``chains`` chains of ``steps``; their first third is forgotten.
+    """Posterior mean and std of the apex, from ``chains`` chains of ``steps``; their first third is burn-in.
 
-    A step moves along some of the axes of :func:`proposal`, more or less far: with all of them at once few places are
-    possible, and what is unknown and what is known well differ in size by a hundred.
+    A step moves along some of the axes of :func:`proposal`, by random distances: along all of them at once few points
+    are possible, and the standard deviations of the axes differ by a factor of a hundred.
     """
     noise = max(config.sensing.ball_position, SMALLEST_NOISE)
     count, dims = question.cube.shape
@@ -88,7 +88,7 @@ def answer(config: TrainConfig, question: Question, chains: int, steps: int, see
 
 
 def _possible(model: FlightModel, question: Question, cube: Tensor, noise: float) -> Tensor:
-    """(M,) bool: points of the prior whose flights explain all that is known."""
+    """(M,) bool: points of the prior whose flights are consistent with all sensed positions."""
     off = (model.sensed(cube.clamp(0.0, 1.0), question.sensed.shape[1]) - question.sensed).abs().amax(2)
     explained = ((off <= noise + ROUNDING) | ~question.used).all(1)
     return explained & ((cube >= 0.0) & (cube <= 1.0)).all(1)

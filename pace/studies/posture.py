@@ -17,7 +17,7 @@ from pace.studies.common import ENDLESS
 from pace.task.env import TableTennisEnv
 
 SEED = 7
-#: Phases of play: a ball that can be hit is in the air, or none.
+#: Phases of play: with and without a ball that can be hit.
 AT_BALL, WAITING = "at the ball", "waiting"
 #: Means over the time of a phase: name, unit.
 MEASURES = {
@@ -31,10 +31,10 @@ SCALES = torch.tensor([100.0, 1.0, 1.0, 1.0, 1.0])
 
 
 class PostureRecorder(ServeRecorder):
-    """How the robots stand and move while they play; robots that are about to fall are left in.
+    """Posture and motion of the robots during play, including robots that are about to fall.
 
     Attributes: ``sums`` (2, len(MEASURES)): sums over instants of each phase, ``instants`` (2,); ``touches``
-    (B,): instants at whose end each body of ``RobotSpec.contacts`` touched anything.
+    (B,): number of instants at whose end each body of ``RobotSpec.contacts`` touched anything.
     """
 
     def __init__(self, env: TableTennisEnv, warmup_serves: int, quota: int) -> None:
@@ -91,7 +91,7 @@ def postures(runs: Sequence[Path], worlds: int, serves: int) -> list[Posture]:
 
 
 def table(found: Sequence[Posture]) -> str:
-    """A row a measure, a column a policy: at the ball / waiting; then touches of bodies other than the feet."""
+    """A row per measure, a column per policy: at the ball / waiting; then touches of bodies other than the feet."""
     header = [f"{AT_BALL} / {WAITING}", *(one.policy for one in found)]
     rows = [["share of time, %", *(" / ".join(f"{100 * share:.0f}" for share in one.phases) for one in found)]]
     for column, (name, unit) in enumerate(MEASURES.items()):

@@ -1,4 +1,4 @@
-"""What can be known of the apex of a serve, and what predictors make of it, by time before the apex."""
+"""Error bounds for the apex of a serve, and the errors of predictors, by time before the apex."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from pace.studies.posterior import Question, answer
 FRAMES = 46  # control steps, 0.9 s: past the apex of every serve
 CHAINS, STEPS = 4, 900
 SEED = 5
-#: What is known at a time: so many of the last sensed positions.
+#: Number of the last sensed positions behind each bound.
 WINDOWS = {"bound, five positions": 5, "bound, whole flight": FRAMES}
 #: Name -> ball preset, randomisation and sensing.
 CASES = {
@@ -42,13 +42,13 @@ CASES = {
     "venue, clean": ("venue", "moderate", "clean"),
     "rubber, ball known, clean": ("rubber", "none", "clean"),
 }
-DRAWN = ("rubber", "rubber, ball known")
+SHOWN = ("rubber", "rubber, ball known")
 BEFORE_APEX = BIN_NAMES[1:]
 
 
 @dataclass(frozen=True)
 class Errors:
-    """RMSE of the apex (3-D, cm) of each bound and predictor, by ``BEFORE_APEX``, NaN where no serve was asked."""
+    """RMSE of the apex (3-D, cm) of each bound and predictor, by ``BEFORE_APEX``, NaN for bins without a serve."""
 
     case: str
     rmse: dict[str, list[float]]
@@ -85,14 +85,14 @@ def _bins(recording: Recording) -> Tensor:
 
 
 def instants_of(recording: Recording) -> list[Tensor]:
-    """For each of ``BEFORE_APEX`` a random control step of every serve (N,) in that bin; -1 where it has none."""
+    """For each of ``BEFORE_APEX`` a random control step of every serve (N,) in that bin; -1 if it has none."""
     generator = torch.Generator().manual_seed(SEED)
     bins = _bins(recording)
     found = []
     for number in range(1, len(BIN_NAMES)):
         suits = recording.valid & (bins == number)
-        draw = torch.rand(suits.shape, generator=generator) * suits
-        found.append(torch.where(suits.any(1), draw.argmax(1), -1))
+        priority = torch.rand(suits.shape, generator=generator) * suits
+        found.append(torch.where(suits.any(1), priority.argmax(1), -1))
     return found
 
 
@@ -124,9 +124,9 @@ def table(found: Sequence[Errors]) -> str:
 
 
 def draw(found: Sequence[Errors], figure: Figure) -> None:
-    """RMSE over the time before the apex in the cases of DRAWN."""
+    """RMSE over the time before the apex in the cases of SHOWN."""
     middle = np.array([0.05, 0.15, 0.25, 0.35, 0.5])
-    shown = [errors for errors in found if errors.case in DRAWN] or list(found[:1])
+    shown = [errors for errors in found if errors.case in SHOWN] or list(found[:1])
     panels = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
     for axes, errors in zip(panels, shown, strict=True):
         for (name, values), colour in zip(errors.rmse.items(), COLOURS, strict=False):

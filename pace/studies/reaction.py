@@ -1,4 +1,4 @@
-"""Paddle reaction: what the ball's impulse does to the arm, and what a paddle of finite mass would do to the ball."""
+"""Paddle reaction: the effect of the ball's impulse on the arm, and of the paddle's finite mass on the ball."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ SEED = 3
 class Strikes:
     """M strikes: arrays (M,) and, over the control steps that follow, (T, M)."""
 
-    speed: Array  # m/s relative along the normal, as asked for
+    speed: Array  # m/s relative along the normal, requested
     impulse: Array  # N s, along the normal
     paddle_speed: Array  # m/s along the normal, of the struck point before the strike
     ball_speed: Array  # m/s after the strike
-    effective_mass: Array  # kg of the paddle at the struck point along the normal, arm and floating base behind it
-    give: Array  # m/s, at which the struck point gives way along the normal, a control step after the strike
+    effective_mass: Array  # kg of the paddle at the struck point along the normal, with arm and floating base
+    give: Array  # m/s, yield speed of the struck point along the normal, a control step after the strike
     velocity_change: Array  # (T, M) m/s, paddle's centre with reaction minus without
     displacement: Array  # (T, M) m, likewise
     ball_mass: float  # kg
@@ -69,7 +69,7 @@ def strike_all(worlds_each: int, gains: float = 1.0) -> Strikes:
 
 
 def _play(count: int, speed: Tensor, reaction: bool, gains: float) -> tuple[Tensor, Worlds, dict[str, Tensor]]:
-    """Swing, strike, follow through: paddle (T, N, 12) after the strike, the worlds, and what the strike was."""
+    """Swing, strike, follow through: paddle (T, N, 12) after the strike, the worlds, and the strike."""
     config = study_config(paddle_reaction=reaction)
     worlds = standing_worlds(config, count)
     targets = smooth_swings(worlds.nominal, count, SWING_STEPS + FOLLOW_STEPS + 1, SEED, arm=0.6, rest=0.02)
@@ -173,12 +173,12 @@ def table(strikes: Strikes) -> str:
 
 
 def draw(strikes: Strikes, figure: Figure) -> None:
-    """Left: change of the paddle's velocity after the strike; right: how far the paddle is from where it would be."""
-    elapsed = 20.0 * np.arange(1, FOLLOW_STEPS + 1)  # ms; the first control step spreads the impulse
+    """Left: change of the paddle's velocity after the strike; right: change of its position."""
+    elapsed = 20.0 * np.arange(1, FOLLOW_STEPS + 1)  # ms; the impulse is distributed over the first control step
     for axes, values, label, scale in zip(
         figure.subplots(1, 2),
         (strikes.velocity_change, strikes.displacement),
-        ("change of the paddle's velocity (m/s)", "change of its place (mm)"),
+        ("change of the paddle's velocity (m/s)", "change of its position (mm)"),
         (1.0, 1e3),
         strict=True,
     ):

@@ -1,4 +1,4 @@
-"""The table and the figure of ``docs/results/recipe.md``: the recipes that were tried, one run a row.
+"""The table and the figure of ``docs/results/recipe.md``: the recipes that were tried, one run per row.
 
 ``runs.csv`` in the folder ``recipe`` of the results lists the runs; ``<recipe>_seed<seed>.csv`` beside it are their
 metrics, and ``<recipe>.yaml`` is the resolved configuration.
@@ -58,7 +58,7 @@ def listed(folder: Path) -> list[Tried]:
 
 
 def take_over(runs: Sequence[Tried], source: Path) -> None:
-    """Write the metrics of those run folders in ``source`` that ``runs`` name, four rows in one, to their files."""
+    """Write the metrics of the run folders of ``runs`` in ``source``, four rows pooled into one, to their files."""
     for tried in runs:
         if (source / tried.run / METRICS).exists():
             write_slim(source / tried.run / METRICS, tried.file)

@@ -1,4 +1,4 @@
-"""What the KL divergence of a PPO update measures when the networks compute in bf16: the update, or the rounding."""
+"""The KL divergence of a PPO update with bf16 networks: the share of the update and of rounding."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from pace.rl.policies import TaskPolicy, load_policy
 from pace.runs.metrics import markdown
 from pace.studies.common import ENDLESS
 
-STEPS = 100  # control steps that each world plays
+STEPS = 100  # control steps of each world
 SEED = 6
-MOVES = (1e-6, 1e-5, 3e-5, 1e-4)  # of every weight: what Adam moves it by in one step at that learning rate
+MOVES = (1e-6, 1e-5, 3e-5, 1e-4)  # of every weight: one step of Adam at that learning rate
 STDS = (0.5, 0.3, 0.2, 0.14, 0.09, 0.05)  # of the policy; algo.std falls from 1 to 0.1
 FORMATS = (torch.bfloat16, torch.float32)
 
 
 @dataclass(frozen=True)
 class Rounding:
-    """Squared shift of the mean action, summed over the joints and meant over the states: (moves, formats)."""
+    """Squared shift of the mean action, summed over the joints, mean over the states: (moves, formats)."""
 
     policy: str
     shifts: Tensor
@@ -34,7 +34,7 @@ class Rounding:
 
 
 def measure(run: Path, worlds: int) -> Rounding:
-    """The policy of ``run`` in the states that it plays, before and after its weights have moved."""
+    """The policy of ``run`` in the states of its rollout, before and after its weights have moved."""
     policy = load_policy(run)
     network = policy.act
     assert isinstance(network, Policy)
@@ -53,9 +53,9 @@ def _states(policy: TaskPolicy, worlds: int) -> Tensor:
 
 @torch.no_grad()
 def shifts(mlp: MLP, states: Tensor, move: float) -> Tensor:
-    """(formats,): mean square of how far the mean action goes when every weight moves up or down by ``move``.
+    """(formats,): mean square of the shift of the mean action if every weight moves up or down by ``move``.
 
-    ``states`` are normalised observations (n, inputs). The weights are as before afterwards.
+    ``states`` are normalised observations (n, inputs). The weights are restored afterwards.
     """
     own, before = mlp.dtype, [weight.clone() for weight in mlp.parameters()]
     still = _means(mlp, states)
@@ -77,7 +77,7 @@ def _means(mlp: MLP, states: Tensor) -> Sequence[Tensor]:
 
 
 def table(found: Rounding) -> str:
-    """One row a standard deviation of the policy; bf16 / float32 by how far the weights moved."""
+    """One row per standard deviation of the policy; bf16 / float32 for each move of the weights."""
     rows = [
         [f"{std:g}", *(" / ".join(f"{value:.2g}" for value in row) for row in found.kl(std).tolist())] for std in STDS
     ]

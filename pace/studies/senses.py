@@ -1,4 +1,4 @@
-"""What a policy's robot knows of its motion capture's delay and of its own pose, by the time since the reset."""
+"""Errors of the on-board estimates of motion capture's delay and of the robot's pose, by the time since the reset."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ ESTIMATED = (
 
 @dataclass(frozen=True)
 class Senses:
-    """Root mean square errors (times, columns) over worlds that play on, in the units of ``COLUMNS``."""
+    """Root mean square errors (times, columns) over worlds without a fall, in the units of ``COLUMNS``."""
 
     policy: str
     errors: Tensor
 
 
 def sense(run: Path, worlds: int) -> Senses:
-    """Play ``worlds`` robots for the longest of ``TIMES``. Errors: :class:`ConfigError` for a policy that does not
+    """Roll out ``worlds`` robots for the longest of ``TIMES``. Errors: :class:`ConfigError` for a policy that does not
     estimate them."""
     policy = load_policy(run)
     if not observed(policy.config.observation).keys() >= NEEDED:
@@ -66,7 +66,7 @@ def errors(env: TableTennisEnv) -> list[Tensor]:
     """Each world's error (N, size) of every column, in its unit; their norms count."""
     sensing, actor, robot = env.sensing, env.actor, env.worlds.robot
     prior = env.config.observation.delay_estimate
-    assert prior is not None  # sense() has checked it
+    assert prior is not None  # guaranteed by sense()
     estimated = {name: POLICY[name].function(actor) for name in ESTIMATED}
     delay = estimated["sensed_delay"] + prior.prior - (sensing.delay * env.worlds.control_dt).unsqueeze(1)
     gravity = [given - robot.projected_gravity for given in (sensing.projected_gravity, estimated["estimated_gravity"])]
@@ -88,14 +88,14 @@ def _angle(given: Tensor, true: Tensor) -> Tensor:
 
 
 def _sensed_paddle(env: TableTennisEnv) -> Tensor:
-    """(N, 3) m, by forward kinematics from what is sensed alone."""
+    """(N, 3) m, by forward kinematics from the sensed signals alone."""
     sensing = env.sensing
     joints = sensing.joint_position + env.worlds.nominal
     return env.actor.onboard.paddle(sensing.base_position, sensing.projected_gravity, sensing.heading, joints)[0]
 
 
 def table(found: Senses) -> str:
-    """One row a time since the reset."""
+    """One row per time since the reset."""
     rows = [
         [f"{time:g} s", *(f"{value:.2f}" if value < 2.0 else f"{value:.1f}" for value in row)]
         for time, row in zip(TIMES, found.errors.tolist(), strict=True)

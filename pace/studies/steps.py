@@ -1,4 +1,4 @@
-"""Physics steps and solver settings: the same motions replayed, and how far joints and paddle come from a fine one."""
+"""Physics steps and solver settings: the same motions replayed, and their deviation from a fine simulation."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ REFERENCE: dict[str, object] = {
     "solver_iterations": 100,
     "line_search_iterations": 50,
 }
-#: Control steps of a window: the paddle's way from the decision to the hit.
+#: Control steps of a window: the paddle's motion from the decision to the hit.
 LENGTH = 15
 INSTANTS = (5, 15)  # control steps after the start at which errors are quoted
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Where W windows went: ``joints`` (L, W, J) rad and ``paddle`` (L, W, 12) after each control step."""
+    """Results of W windows: ``joints`` (L, W, J) rad and ``paddle`` (L, W, 12) after each control step."""
 
     joints: Array
     paddle: Array
@@ -73,7 +73,7 @@ def replay(windows: Windows, engine: dict[str, object], friction_loss: float = 0
 
 
 def deviation(motion: Motion, reference: Motion) -> Deviation:
-    """How far ``motion`` is from ``reference``."""
+    """Deviation of ``motion`` from ``reference``."""
     joints, paddle = motion.joints - reference.joints, motion.paddle - reference.paddle
     return Deviation(
         joints=np.sqrt(np.mean(joints**2, axis=2)),
@@ -85,7 +85,7 @@ def deviation(motion: Motion, reference: Motion) -> Deviation:
 
 @dataclass(frozen=True)
 class Case:
-    """A setting, how far it takes the motion, and what it costs."""
+    """A setting, its deviation, and its cost."""
 
     name: str
     deviation: Deviation
@@ -154,7 +154,7 @@ def draw_steps(cases: list[Case], figure: Figure) -> None:
             own = cases[index * len(STEPS) : (index + 1) * len(STEPS)]
             for instant, style in zip(INSTANTS, ("o--", "o-"), strict=True):
                 values = [np.median(scale * getattr(case.deviation, name)[instant - 1]) for case in own]
-                shift = 1.0 + 0.06 * index  # the engines' points would lie on each other
+                shift = 1.0 + 0.06 * index  # else the engines' points would overlap
                 title = f"{engine}, after {20 * instant} ms"
                 axes.loglog(shift * steps, values, style, color=colour, lw=1.5, ms=4, label=title)
         axes.set(xlabel="physics step (ms)", ylabel=label)

@@ -1,4 +1,4 @@
-"""Motions to replay: states and joint targets of control steps, from a policy's run or from random swings."""
+"""Motions to replay: states and joint targets of control steps, from a policy's rollout or from random swings."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SEED = 7
 @dataclass(frozen=True)
 class Swings:
     """T control steps of N worlds. ``qpos`` (T, N, 7 + J), ``qvel`` (T, N, 6 + J): the state before each step;
-    ``targets`` (T, N, J) rad: what the joints are told in it; ``ends`` (T, N) bool: the world is reset after
+    ``targets`` (T, N, J) rad: the joint targets in it; ``ends`` (T, N) bool: the world is reset after
     it; ``source``."""
 
     qpos: Tensor
@@ -63,7 +63,7 @@ def random_swings(num_worlds: int, steps: int) -> Swings:
 
 
 def policy_swings(run: Path, num_worlds: int, steps: int) -> Swings:
-    """What a trained policy does with serves, without randomisation, from a run folder or checkpoint."""
+    """Motions of a trained policy that plays serves, without randomisation, from a run folder or checkpoint."""
     policy = load_policy(run)
     changes = ["engine=native", f"engine.physics_dt={RECORDED_DT}", "engine.threads=1", "randomization=none"]
     env = policy.make_env(num_worlds, "cpu", SEED, changes)

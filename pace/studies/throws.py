@@ -1,4 +1,4 @@
-"""Balls that are thrown so that they meet the moving paddle."""
+"""Balls that are thrown at the moving paddle."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from torch import Tensor
 
 from pace.sim.worlds import Worlds
 
-THROW_TIME = 0.01  # s to the meeting: the middle of a control step
+THROW_TIME = 0.01  # s to the contact: the middle of a control step
 SEED = 3
 
 
 def throw(worlds: Worlds, speed: Tensor) -> tuple[Tensor, Tensor]:
-    """Position and velocity (N, 3) of balls that meet the blades THROW_TIME later, at ``speed`` (N,) m/s along the
+    """Position and velocity (N, 3) of balls that hit the blades THROW_TIME later, at ``speed`` (N,) m/s along the
     normal and up to 5 cm off their centres."""
     paddle = worlds.kinematics.paddle_path[:, -1]
     centre, normal, velocity, turning = paddle.split(3, dim=1)
-    draw = torch.rand(len(speed), 3, generator=torch.Generator().manual_seed(SEED)) - 0.5
-    across = draw - (draw * normal).sum(1, keepdim=True) * normal
-    offset = 0.05 * across / across.norm(dim=1, keepdim=True) * draw[:, :1].abs() * 2
+    uniform = torch.rand(len(speed), 3, generator=torch.Generator().manual_seed(SEED)) - 0.5
+    across = uniform - (uniform * normal).sum(1, keepdim=True) * normal
+    offset = 0.05 * across / across.norm(dim=1, keepdim=True) * uniform[:, :1].abs() * 2
     at_once = velocity + torch.linalg.cross(turning, offset)
     approach = at_once - speed.unsqueeze(1) * normal
     touching = worlds.config.ball.radius + worlds.config.ball.table.paddle_half_thickness

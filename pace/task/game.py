@@ -74,8 +74,8 @@ class Game(GameState, Stateful):
         self._close = Launch(game_kernels.close, count, device, **given, **seen)
         self._start_serve = MaskedLaunch(game_kernels.start_serve, count, device, **given)
         serves = config.serves_per_episode if config.random_phase else 0
-        drawn = {"seed": self._seed, "serves": serves, "fresh": self.clock.fresh, "index": self.clock.index}
-        self._start_episode = MaskedLaunch(game_kernels.start_episode, count, device, **drawn)
+        sampled = {"seed": self._seed, "serves": serves, "fresh": self.clock.fresh, "index": self.clock.index}
+        self._start_episode = MaskedLaunch(game_kernels.start_episode, count, device, **sampled)
 
     def judge(self) -> None:
         """The referee consumes the events of the control step."""

@@ -181,7 +181,7 @@ class Show:
     Args:
         policy: as :func:`pace.rl.load_policy` gives it.
         overrides: of the saved task, after those of :data:`SHOW_OVERRIDES`.
-        seed: of all draws.
+        seed: of all random numbers.
 
     Errors: :class:`pace.config.ConfigError` for a wrong override.
     """

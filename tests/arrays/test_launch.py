@@ -69,7 +69,7 @@ def launch(**others: Any) -> Launch:
     return Launch(_scale, 2, CPU, **arguments(**others))
 
 
-def test_names_may_come_in_any_order_and_a_replay_reads_the_memory_anew() -> None:
+def test_names_may_come_in_any_order_and_a_replay_reads_the_memory_again() -> None:
     for order in (reversed, sorted):
         given = arguments()
         scale = Launch(_scale, 2, CPU, **{name: given[name] for name in order(list(given))})

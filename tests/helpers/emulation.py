@@ -47,7 +47,7 @@ class Recording(TorchDispatchMode):
     """One call's operators and launches, with the numbers and addresses they were given, to be done again.
 
     What a CUDA graph keeps, no more: Python does not run again, numbers are those of the recorded call, and temporary
-    tensors and arrays stay where they were. Only random draws go on, as those of a registered generator do.
+    tensors and arrays stay in place. Only random numbers continue, as those of a registered generator do.
     Unlike a capture, recording does the work too; so the first :meth:`replay` does nothing.
     """
 

@@ -102,7 +102,7 @@ def test_noise_is_reduced_as_a_filter_of_this_gain_does() -> None:
     assert float(error[3:].square().sum().sqrt()) == pytest.approx(expected, rel=0.1)
 
 
-def test_one_world_begins_anew_with_what_is_sensed() -> None:
+def test_one_world_restarts_from_the_sensed_values() -> None:
     tumbling = Tumbling(2, noise=0.05)
     for _ in range(10):
         tumbling.step()

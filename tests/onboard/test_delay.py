@@ -78,7 +78,7 @@ def test_the_prior_is_worth_what_it_says() -> None:
     assert float(turning.estimate["delay"]) + CONFIG.prior == pytest.approx(expected, abs=1e-6)
 
 
-def test_one_world_begins_anew() -> None:
+def test_one_world_restarts() -> None:
     turning = Turning(torch.tensor([0.0, 0.03]))
     turning.run(100)
     before = turning.estimate.state.clone()

@@ -24,7 +24,7 @@ NUMBERS = JointEstimateConfig(acceleration=40.0, position_noise=0.0058, velocity
 
 
 class Shaking:
-    """Joints with a constant acceleration, drawn anew each control step as the filter has it, and their sensors."""
+    """Joints with a constant acceleration, resampled each control step as the filter has it, and their sensors."""
 
     def __init__(self, count: int, push: float = 1.0, noise: float = 1.0) -> None:
         self.generator = torch.Generator().manual_seed(3)
@@ -87,7 +87,7 @@ def test_a_steady_motion_is_followed_without_lag() -> None:
         torch.testing.assert_close(shaking.estimate["velocity"], shaking.velocity, atol=1e-4, rtol=0.0)
 
 
-def test_one_world_begins_anew_with_what_is_sensed() -> None:
+def test_one_world_restarts_from_the_sensed_values() -> None:
     shaking = Shaking(2)
     for _ in range(10):
         shaking.step()

@@ -57,7 +57,7 @@ def test_real_updates_and_an_exact_resume(train, tmp_path: Path, capsys: pytest.
     assert len(set(rewards[0])) == 4
 
 
-def test_init_from_starts_anew_with_the_weights(train, tmp_path: Path) -> None:
+def test_init_from_starts_a_new_run_with_the_weights(train, tmp_path: Path) -> None:
     assert real_run(train, tmp_path / "old", 1) == 0
     assert real_run(train, tmp_path / "new", 1, f"init_from={tmp_path / 'old'}") == 0
     old, new = load_checkpoint(tmp_path / "old"), load_checkpoint(tmp_path / "new")
@@ -127,7 +127,7 @@ def test_a_run_does_not_mix_with_another_in_its_folder(
     metrics = (tmp_path / "metrics.csv").read_text()
     first = tmp_path / "checkpoints" / "update_00000001"
     assert real_run(train, tmp_path, 1) == 2
-    assert f"resume={tmp_path} goes on from it" in capsys.readouterr().err
+    assert f"resume={tmp_path} continues it" in capsys.readouterr().err
     assert train(f"resume={first}", f"samples={3 * UPDATE}", "progress=false") == 2
     assert "checkpoint of update 2" in capsys.readouterr().err
     assert (tmp_path / "metrics.csv").read_text() == metrics

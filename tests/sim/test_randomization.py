@@ -139,7 +139,7 @@ def test_the_actuator_delay_changes_its_world_alone(worlds: Worlds) -> None:
 
 
 @pytest.mark.parametrize("engine", ["native", "mjwarp"])
-def test_a_reset_draws_anew_for_its_world_alone(engine: str) -> None:
+def test_a_reset_resamples_its_world_alone(engine: str) -> None:
     config = load_train_config([f"engine={engine}", "randomization=moderate", "engine.threads=1"])
     config.randomization.push_interval = [0.0, 0.0]
     worlds = Worlds(config, WORLDS, "cpu")

@@ -61,7 +61,7 @@ def test_a_clean_flight_of_a_known_ball_leaves_nothing_unknown() -> None:
     used = torch.arange(12).repeat(16, 1) > 6
     found = answer(task, Question(recording.cube, recording.sensed, used), chains=2, steps=60)
     assert (found.mean - recording.apex).norm(dim=1).max().item() < 0.005
-    assert found.spread.max().item() < 0.005
+    assert found.std.max().item() < 0.005
 
 
 def test_before_anything_is_seen_the_bound_is_the_spread_of_the_serves() -> None:
@@ -71,7 +71,7 @@ def test_before_anything_is_seen_the_bound_is_the_spread_of_the_serves() -> None
     prior = recording.apex[everyone].var(0).sum().sqrt().item()
     some = Question(recording.cube[:48], recording.sensed[:48], torch.zeros(48, 1, dtype=torch.bool))
     found = answer(task, some, chains=4, steps=200)
-    assert found.spread.mean().item() == pytest.approx(prior, rel=0.1)
+    assert found.std.mean().item() == pytest.approx(prior, rel=0.1)
     truth = recording.apex[:48]
     assert 100 * (found.mean - truth).square().sum(1).mean().sqrt().item() == pytest.approx(100 * prior, rel=0.2)
 
@@ -83,7 +83,7 @@ def test_the_error_of_the_posterior_mean_is_the_spread_of_the_posterior() -> Non
     used = torch.arange(28).repeat(80, 1) >= 23
     found = answer(task, Question(recording.cube, recording.sensed, used), chains=2, steps=300)
     error = (found.mean - recording.apex).square().sum(1).mean().sqrt().item()
-    assert error == pytest.approx(found.spread.square().mean().sqrt().item(), rel=0.2)
+    assert error == pytest.approx(found.std.square().mean().sqrt().item(), rel=0.2)
     assert 0.005 < error < 0.02
 
 

@@ -207,7 +207,7 @@ def port() -> int:
 
 @pytest.fixture
 def page(policy: TaskPolicy, port: int) -> Iterator[tuple[object, threading.Thread]]:
-    """A page that plays on a thread of its own, and the thread."""
+    """A page that plays on a separate thread, and the thread."""
     pytest.importorskip("mjviser")
     from pace.viewer.web import Page
 
