@@ -76,6 +76,7 @@ def all_weights(trainer: Trainer) -> dict[str, torch.Tensor]:
     return {**trainer.agent.state_dict(), **{f"predictor.{k}": v for k, v in trainer.predictor.state_dict().items()}}
 
 
+@pytest.mark.slow
 def test_it_learns_the_dummy_task(tmp_path: Path) -> None:
     trainer = make_trainer(tmp_path, updates=60)
     before = {name: value.clone() for name, value in all_weights(trainer).items()}
@@ -134,6 +135,7 @@ def test_a_spread_that_may_rise_resumes_as_it_was(tmp_path: Path) -> None:
     assert learner(second).agent.actor.std[0].item() == pytest.approx(0.5)
 
 
+@pytest.mark.slow
 def test_later_updates_can_be_longer_and_resume_exactly(tmp_path: Path) -> None:
     def later(path: Path, samples: int, resume: bool = False) -> Trainer:
         algo = replace(make_config().algo, later_steps=[SchedulePoint(2.0 * UPDATE, 18.0)])
@@ -155,6 +157,7 @@ def test_later_updates_can_be_longer_and_resume_exactly(tmp_path: Path) -> None:
         replace(make_config().algo, later_steps=[SchedulePoint(0.0, 1.5)])
 
 
+@pytest.mark.slow
 def test_a_run_changes_to_float32_when_its_spread_is_small_and_resumes_exactly(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

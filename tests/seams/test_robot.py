@@ -65,6 +65,7 @@ def test_its_parts_are_those_of_its_mjcf(run: Path) -> None:
     np.testing.assert_allclose(model.actuator_gainprm[0, [4, 6]], [5.0, 1.0])
 
 
+@pytest.mark.slow
 def test_its_policy_plays_and_is_evaluated(folder: Path, run: Path) -> None:
     policy = load_policy(run)
     env = policy.make_env(2, "cpu")
@@ -79,6 +80,7 @@ def test_its_policy_plays_and_is_evaluated(folder: Path, run: Path) -> None:
     assert json.loads((folder / "table" / "evaluation.json").read_text())["rows"][0]["serves"] >= 2
 
 
+@pytest.mark.slow
 def test_its_policy_is_exported(folder: Path, run: Path) -> None:
     onnx = pytest.importorskip("onnx")
     assert command(export, str(run), f"out={folder / 'file'}", "check_worlds=2", "check_steps=5") == 0
