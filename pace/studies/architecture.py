@@ -101,7 +101,7 @@ def levels(rooms: Mapping[str, Room]) -> dict[str, int]:
 def arrows(rooms: Mapping[str, Room]) -> list[tuple[str, str]]:
     """Pairs of a room and one that it imports, but for those that follow from the others."""
 
-    def below(name: str) -> set[str]:
+    def below(name: str) -> frozenset[str]:
         return rooms[name].imports.union(*(below(other) for other in rooms[name].imports))
 
     return [
