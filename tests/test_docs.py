@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from pace.command.table import COMMANDS
+from pace.command.table import COMMANDS, TRAIN_GROUPS
+from pace.config.names import choices
 from pace.moved import MOVED
 from pace.studies import architecture
 
@@ -98,3 +99,16 @@ def test_the_port_tables_are_those_of_the_exported_file() -> None:
     for name, port in (readings(21) | results(21)).items():
         assert rows[name] == ("J" if port.size == 21 else str(port.size), port.unit)
     assert rows["state"] == rows["state_next"] == ("S", "-")
+
+
+def test_the_readme_lists_commands_groups_and_folders() -> None:
+    text = (ROOT / "README.md").read_text()
+    assert [name for name in COMMANDS if f"| `pace {name}" not in text] == []
+    rooms = [name for name, room in architecture.read_rooms().items() if (ROOT / "pace" / name).is_dir()]
+    assert [name for name in rooms if f"`pace/{name}/`" not in text] == []
+    for group in TRAIN_GROUPS:
+        listed = re.search(rf"^\| `{group}` \| ([^|]+) \|", text, re.MULTILINE)
+        assert listed, group
+        named = listed[1].strip().removesuffix(", ...").split(", ")
+        assert set(named) <= set(choices(group)), group
+        assert "..." in listed[1] or set(named) == set(choices(group)), group
