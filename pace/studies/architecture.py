@@ -101,8 +101,8 @@ def levels(rooms: Mapping[str, Room]) -> dict[str, int]:
 def arrows(rooms: Mapping[str, Room]) -> list[tuple[str, str]]:
     """Pairs of a room and one that it imports, but for those that follow from the others."""
 
-    def below(name: str) -> set[str]:
-        return set(rooms[name].imports).union(*(below(other) for other in rooms[name].imports))
+    def below(name: str) -> frozenset[str]:
+        return rooms[name].imports.union(*(below(other) for other in rooms[name].imports))
 
     return [
         (name, other)
