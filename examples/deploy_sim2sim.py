@@ -77,7 +77,7 @@ class Controller:
         self._state = np.zeros((1, self.meta["inputs"]["state"]["size"]), dtype=np.float32)
 
     def __call__(self, readings: Mapping[str, Vector], new_ball: bool) -> Vector:
-        """Joint targets (21,) rad, in the order of ``meta["joint_names"]``.
+        """Joint targets (J,) rad, in the order of ``meta["joint_names"]``.
 
         Args: readings: the sensed inputs by name (``meta["inputs"]`` describes them), each of its own size;
         new_ball: this is the first frame in which a new ball is seen.

@@ -17,7 +17,7 @@ from pace.bench import physics, report, training, update
 from pace.config.base import parse
 from pace.config.commands import BenchConfig
 from pace.devices import resolve_device
-from pace.runs.run_folder import default_folder, versions
+from pace.runs.run_folder import make_out, versions
 
 BUSY_LOAD = 0.5  # per core; a higher load gives a warning
 
@@ -26,7 +26,7 @@ def bench_from_config(composed: DictConfig) -> None:
     """Measure as configured; print the table, write the JSON, print its path."""
     config = parse(composed, BenchConfig)
     overrides = [o for o in HydraConfig.get().overrides.task if not o.lstrip("+~").startswith("bench")]
-    path = Path(config.out or default_folder(config.name)) / report.FILE
+    path = make_out(config.out, config.name) / report.FILE
     measure(config, overrides, path)
     print(f"wrote {path}")
 

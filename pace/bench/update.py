@@ -18,7 +18,6 @@ from pace.rl.agent import Agent, compute_dtype
 from pace.rl.ppo import PPO
 from pace.rl.rollout import Rollout
 
-ACTIONS = 21
 Call = Callable[[], object]
 
 
@@ -50,7 +49,7 @@ class RandomTask:
 def our_update(options: BenchOptions, algo: AlgoConfig, precision: str, device: torch.device) -> Call:
     """One update of :class:`pace.rl.ppo.PPO` on a filled rollout."""
     algo = replace(algo, autocast=precision)
-    agent = Agent(options.policy_size, options.critic_size, ACTIONS, algo, device)
+    agent = Agent(options.policy_size, options.critic_size, options.action_size, algo, device)
     rollout = Rollout(RandomTask(options, device), agent, algo.steps)
     rollout.begin()
     for step in range(algo.steps):
@@ -71,9 +70,9 @@ def rsl_rl_update(options: BenchOptions, algo: AlgoConfig, mixed_precision: bool
     observation = TensorDict(sizes, batch_size=[worlds], device=device)
     groups = {"actor": ["policy"], "critic": ["critic"]}
     gaussian = {"class_name": "GaussianDistribution", "init_std": algo.std[0].value}
-    actor = MLPModel(observation, groups, "actor", ACTIONS, algo.actor_hidden, "elu", True, gaussian)
+    actor = MLPModel(observation, groups, "actor", options.action_size, algo.actor_hidden, "elu", True, gaussian)
     critic = MLPModel(observation, groups, "critic", 1, algo.critic_hidden, "elu", True)
-    storage = RolloutStorage("rl", worlds, algo.steps, observation, [ACTIONS], str(device))
+    storage = RolloutStorage("rl", worlds, algo.steps, observation, [options.action_size], str(device))
     learner = RslPPO(
         actor,
         critic,
@@ -95,7 +94,7 @@ def matrix_products(options: BenchOptions, algo: AlgoConfig, device: torch.devic
     """The bf16 matrix products of one pass, forward and backward, over the same minibatches; nothing else."""
     rows = options.update_worlds * algo.steps // algo.minibatches
     networks = [
-        _layers(rows, [options.policy_size, *algo.actor_hidden, ACTIONS], device),
+        _layers(rows, [options.policy_size, *algo.actor_hidden, options.action_size], device),
         _layers(rows, [options.critic_size, *algo.critic_hidden, 1], device),
     ]
 

@@ -14,6 +14,9 @@ from pace.config.names import check_renamed, split_override
 #: Options of Hydra whose value is the next argument.
 HYDRA_OPTIONS = ("--cfg", "-c", "--info", "-i", "--package", "-p", "--config-name", "-cn", "--config-dir", "-cd")
 
+#: Tables of the configuration with keys of the users' own.
+OPEN_TABLES = ("reward.terms.", "observation.estimates.")
+
 
 def prepare(name: str, arguments: Sequence[str]) -> list[str]:
     """Arguments of the command ``name`` in Hydra's syntax, with its own keys and groups only.
@@ -28,11 +31,17 @@ def prepare(name: str, arguments: Sequence[str]) -> list[str]:
     if command.rest:
         given = name_list(given, command.rest)
     check_renamed(plain_overrides(given))
+    given = [_open(argument) for argument in given]
     check_keys(name, command, given)
     if command.collected:
         given = collect_overrides(given, (*command.groups, *command.training_keys))
     changes = [index for index in range(len(given)) if is_override(given, index)]  # Hydra wants them side by side
     return [given[i] for i in changes] + [argument for i, argument in enumerate(given) if i not in changes]
+
+
+def _open(argument: str) -> str:
+    """``argument`` so that Hydra may add its key, if that lies in a table to which users add keys."""
+    return f"++{argument}" if argument.startswith(OPEN_TABLES) else argument
 
 
 def name_options(arguments: list[str], command: Command) -> list[str]:

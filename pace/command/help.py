@@ -12,7 +12,7 @@ from textwrap import fill
 from pace.command.keys import Key, file_keys, heading
 from pace.command.table import COMMANDS, Command
 from pace.config.base import ConfigError, config_dir, meant
-from pace.config.names import check_choice, choices
+from pace.config.names import check_choice, check_renamed, choices
 
 WIDTH = 96
 COLUMN = 34  # of the comments
@@ -106,6 +106,7 @@ def group_help(name: str, command: Command, group: str, choice: str = "") -> str
         raise ConfigError(f"pace {name} takes no group {group}{meant(group, command.groups)} (groups: {known})")
     names = choices(group)
     if choice:
+        check_renamed([f"{group}={choice}"])
         check_choice(group, choice)
     usual = default_choices(command).get(group, "")
     choice = choice or (usual if usual in names else names[0])

@@ -127,7 +127,7 @@ COMMANDS = {
             "train=false out=docs/results/recipe     # table and figure again, from the CSVs",
         ),
         groups=tuple(group for group in TRAIN_GROUPS if group != "experiment"),
-        training_keys=("num_worlds", "processes", "device", "curriculum", "checkpoint_minutes", "tensorboard"),
+        training_keys=("num_worlds", "processes", "device", "curriculum", "checkpoint_minutes", "tensorboard", "plugins"),
         collected=True,
         refused={"experiment": "experiments= names them", "seed": "seeds= lists them", "minutes": "samples= ends runs"},
     ),
@@ -152,7 +152,7 @@ COMMANDS = {
         about="Writes bench.json. Choices and values of the training change what is measured; keep the machine idle.",
         examples=("bench=quick num_worlds=64", "bench.parts=[physics,update] bench.repeats=11"),
         groups=("bench", *TRAIN_GROUPS),
-        training_keys=("name", "num_worlds", "processes", "device", "seed", "init_from", "out"),
+        training_keys=("name", "num_worlds", "processes", "device", "seed", "init_from", "out", "plugins"),
         refused={"samples": "bench.train_updates says how long it trains", "minutes": "it ends by itself"},
     ),
     "validate": Command(
@@ -175,7 +175,7 @@ COMMANDS = {
             "robot", "ball", "serve", "reward", "randomization", "sensing", "engine", "algo", "predictor", "experiment",
         ),
         training_keys=(
-            "name", "num_worlds", "device", "seed", "samples", "minutes", "out", "tensorboard", "progress",
+            "name", "num_worlds", "device", "seed", "samples", "minutes", "out", "tensorboard", "progress", "plugins",
         ),
     ),
     "studies": Command(

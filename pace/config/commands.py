@@ -21,6 +21,7 @@ class BenchOptions:
     update_worlds: int
     policy_size: int
     critic_size: int
+    action_size: int
     train_updates: int
     memory_updates: int
 
@@ -206,6 +207,7 @@ class StudiesConfig:
     cases: list[str]
     predictors: list[str]
     out: str | None
+    plugins: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         for name in ("worlds", "serves"):

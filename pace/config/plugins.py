@@ -115,7 +115,7 @@ def attribute(path: str) -> Any:
 def _import(module: str) -> Any:
     try:
         return importlib.import_module(module)
-    except (ImportError, ValueError) as error:
+    except (ImportError, ValueError, SyntaxError) as error:
         raise ConfigError(f"plugins: {module} cannot be imported: {error}") from error
 
 
@@ -124,8 +124,11 @@ def use_named(composed: DictConfig) -> None:
 
     ``plugins`` then holds all of them, so that a saved configuration names the modules that it needs.
     """
+    given = composed.get("plugins")
+    if isinstance(given, str):
+        raise ConfigError(f"plugins is a list of modules: write plugins=[{given}]")
     found = [path.partition(":")[0] for path in _import_paths(composed)]
-    composed["plugins"] = list(dict.fromkeys([*(composed.get("plugins") or []), *found]))
+    composed["plugins"] = list(dict.fromkeys([*(given or []), *found]))
     use(composed["plugins"])
 
 

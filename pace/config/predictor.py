@@ -47,6 +47,10 @@ class PredictorPriors:
     bounce: Prior = field(default_factory=lambda: Prior([-1.0, -0.1, 0.78], [0.25, 0.2, 0.02]))  # m
     # a serve crosses the table (|x| <= 1.37, |y| <= 0.76) between its top and about 0.5 m above it
     position: Prior = field(default_factory=lambda: Prior([0.0, 0.0, 1.0], [1.0, 0.4, 0.25]))  # m
+    # times, as features: since the launch in seconds and in frames, and since the bounce in frames
+    age: Prior = field(default_factory=lambda: Prior([0.35], [0.25]))  # s
+    count: Prior = field(default_factory=lambda: Prior([20.0], [10.0]))
+    bounced: Prior = field(default_factory=lambda: Prior([0.0], [6.0]))
     # between two frames (20 ms), in which serves differ by a few centimetres
     step: Prior = field(default_factory=lambda: Prior([-0.11, 0.0, 0.0], [0.02, 0.02, 0.03]))  # m
     # outputs: the apex lies at or behind the robot's end of the table
@@ -56,7 +60,7 @@ class PredictorPriors:
 
     def __post_init__(self) -> None:
         for f in fields(self):
-            size = 1 if f.name == "target_time" else 3
+            size = 1 if f.name in ("age", "count", "bounced", "target_time") else 3
             require(len(getattr(self, f.name).mean) == size, f"predictor.priors.{f.name} needs {size} numbers each")
 
 

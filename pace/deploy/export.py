@@ -32,7 +32,7 @@ from pace.deploy.graph import (
 )
 from pace.onboard.estimate import columns
 from pace.rl.policies import TaskPolicy, load_policy
-from pace.runs.run_folder import VERSIONS, default_folder, git_state, versions
+from pace.runs.run_folder import VERSIONS, git_state, make_out, versions
 from pace.sim.robot import build_model, joint_gains, motor_lines, nominal_pose
 from pace.sim.robot_spec import RobotSpec
 from pace.task.observations import POLICY, layout
@@ -58,10 +58,9 @@ def export_from_config(composed: DictConfig) -> None:
     config = parse(composed, ExportConfig)
     assert config.run is not None  # ExportConfig has seen to it
     policy = load_policy(config.run)
-    folder = Path(config.out) if config.out else default_folder("export")
-    if folder.suffix == ".onnx":
-        raise ExportError(f"out={folder} must be a folder, in which policy.onnx is written")
-    out = folder / FILE
+    if config.out and Path(config.out).suffix == ".onnx":
+        raise ExportError(f"out={config.out} must be a folder, in which policy.onnx is written")
+    out = make_out(config.out, "export") / FILE
     differences = export_policy(policy, out, config)
     count = config.check_worlds * config.check_steps
     units = {name: port.unit for name, port in output_ports(policy.config).items()}

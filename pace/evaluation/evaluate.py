@@ -32,7 +32,7 @@ from pace.evaluation.sweep import (
 )
 from pace.rl.policies import TaskPolicy, built_in_policy, load_policy
 from pace.runs.progress import SECONDS_PER_LINE, clock
-from pace.runs.run_folder import default_folder, versions
+from pace.runs.run_folder import default_folder, make_out, versions
 
 TASK_PARTS = ("robot", "ball", "engine", "randomization", "sensing")  # parts of the task in the report
 
@@ -48,6 +48,7 @@ def evaluate_from_config(composed: DictConfig) -> None:
     task = override_task(policy.config, overrides)
     cells = [plan_cell(change, config, policy, overrides, context["versions"]) for change in changes(config, task)]
     finished = finished_cells(folder, cells) if cells else {}
+    make_out(str(folder), "evaluation")
     if config.rows:
         evaluate_table(config, policy, task, overrides, folder, context)
     if cells:
@@ -72,7 +73,6 @@ def evaluate_table(
         _with_bar(config, policy, name, name, config.serves, config.num_worlds, config.device, overrides)
         for name in config.rows
     ]
-    folder.mkdir(parents=True, exist_ok=True)
     print(f"\n{tables(rows, config.paper)}\n")
     files, target = write_report(folder, rows, config.paper, context), (task.landing_target[0], task.landing_target[1])
     _announce([*files, *write_figures(folder, rows, task.ball.table, target)])

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from pace.config.task import TaskConfig
 from pace.onboard.ball_track import BallTrack, Track
 from pace.onboard.estimate import Estimate
-from pace.onboard.estimates import make_estimates, observed
+from pace.onboard.estimates import Entry, make_estimates, observed
 from pace.onboard.prediction import Prediction, PredictionReader, no_prediction
 from pace.sim.robot import nominal_pose
 
@@ -90,6 +90,9 @@ class Onboard(nn.Module):
         self.register_buffer("nominal", nominal, persistent=False)
         self.track, self.reader = BallTrack(config), PredictionReader(config)
         self.entries = observed(config.observation)
+        #: Those that the paddle's pose is computed from, and the others.
+        self.before = {name: entry for name, entry in self.entries.items() if entry.replaces}
+        self.after = {name: entry for name, entry in self.entries.items() if not entry.replaces}
         self.estimates = nn.ModuleDict(make_estimates(config, len(nominal)))
         self.paddle = paddle
         self.predictor = predictor if config.predictor.enabled else None
@@ -135,17 +138,12 @@ class Onboard(nn.Module):
         """All signals from readings, ball track and the estimates' previous states."""
         known = {**sensing._asdict(), "action": action, "track": track.positions}
         known |= {"turned": track.turned, "something_to_hit": track.something_to_hit}
-        states = self._advance(known, advance, for_the_pose=True)
+        states = _advanced(self.before, known, advance)
         paddle = self._paddle_pose(sensing, states)
         output, prediction = self._predict(track, sensing.base_position)
         known |= {"paddle_position": paddle[0], "paddle_normal": paddle[1], **prediction._asdict()}
-        states |= self._advance(known, advance, for_the_pose=False)
+        states |= _advanced(self.after, known, advance)
         return Signals(sensing, action, track, output, *prediction, *paddle, states)
-
-    def _advance(self, known: Mapping[str, Tensor], advance: Advance, for_the_pose: bool) -> dict[str, Tensor]:
-        """New states of the estimates that the paddle's pose is computed from, or of the others."""
-        chosen = {name: entry for name, entry in self.entries.items() if bool(entry.replaces) == for_the_pose}
-        return {name: advance(name, {read: known[read] for read in entry.reads}) for name, entry in chosen.items()}
 
     def _paddle_pose(self, sensing: Readings, states: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         """The paddle's pose from the estimates' states, or from the readings that no estimate replaces."""
@@ -162,3 +160,8 @@ class Onboard(nn.Module):
             return nothing, no_prediction(base_position)
         output = self.predictor(track.positions)
         return output, self.reader(output, track.something_to_hit, base_position)
+
+
+def _advanced(entries: Mapping[str, Entry], known: Mapping[str, Tensor], advance: Advance) -> dict[str, Tensor]:
+    """New states of these estimates, from the signals that are known."""
+    return {name: advance(name, {read: known[read] for read in entry.reads}) for name, entry in entries.items()}

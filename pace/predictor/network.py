@@ -21,9 +21,6 @@ from pace.predictor.filter import FlightFilter
 
 OUTPUT_SIZES = {"apex": 3, "target": 3, "target_time": 1}
 
-COUNT_CENTRE, COUNT_SCALE = 20.0, 10.0  # frames since the launch
-# Scales of the fit's times, to numbers of order one (s; frames after the bounce).
-AGE_CENTRE, AGE_SCALE, FRAMES_SCALE = 0.35, 0.25, 6.0
 LARGEST_FEATURE = 5.0
 
 
@@ -49,8 +46,8 @@ class FlightFeatures(nn.Module):
     def __init__(self, frames: int, priors: PredictorPriors) -> None:
         super().__init__()
         self.filter = FlightFilter(frames, priors)
-        ages = [AGE_SCALE, AGE_SCALE, AGE_SCALE, FRAMES_SCALE, 1.0]
-        times = Prior([AGE_CENTRE, 0.0, AGE_CENTRE, 0.0, 0.0], ages)
+        (age, spread), (start, bounced) = ((prior.mean[0], prior.std[0]) for prior in (priors.age, priors.bounced))
+        times = Prior([age, 0.0, age, start, 0.0], [spread, spread, spread, bounced, 1.0])
         before, after = (priors.position, priors.fall_velocity, priors.fall), (priors.rise_velocity, priors.rise)
         parts = (times, *before, priors.bounce, *after, priors.apex)
         self.register_buffer("centre", torch.tensor([v for part in parts for v in part.mean]), persistent=False)
@@ -143,7 +140,7 @@ class PredictorNetwork(BallPredictor):
         frames = positions.unflatten(1, (self.frames, 3))
         if self.counted:
             moved = (frames[:, 1:] != frames[:, :-1]).any(2).sum(1, keepdim=True)
-            count = (moved - COUNT_CENTRE) / COUNT_SCALE
+            count = (moved - self.priors.count.mean[0]) / self.priors.count.std[0]
             return torch.cat([self._steps(frames[:, -COUNTED_FRAMES:]), count], dim=1)
         return self._steps(frames)
 

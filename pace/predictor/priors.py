@@ -1,7 +1,7 @@
 """The predictor's priors for the serves of a task, transferred from the serves that they were measured on.
 
-The defaults of :class:`pace.config.task.PredictorPriors` were measured on :data:`MEASURED_ON`. For other serves, the
-flight model of :mod:`pace.predictor.filter` shifts each mean by its change for the middle of the ranges, and scales
+The defaults of :class:`pace.config.predictor.PredictorPriors` were measured on :data:`MEASURED_ON`. For other serves,
+the flight model of :mod:`pace.predictor.filter` shifts each mean by its change for the middle of the ranges, and scales
 each standard deviation by the change of its range over the corners of the ranges. For the measured serves the priors
 equal the defaults, to the last digit.
 """
@@ -99,6 +99,9 @@ def _flights(launch: Tensor, launches: Launches) -> dict[str, Tensor]:
         "rise_velocity": rebounding,
         "bounce": bounce.position,
         "step": step,
+        "age": 0.5 * (bounce_time + rise_time),
+        "count": 0.5 * (bounce_time + rise_time) / launches.control_dt,
+        "bounced": rise_time / launches.control_dt,
         "apex": apex,
         "target": target,
         "target_time": 0.5 * (bounce_time + rise_time),  # in the middle of the flight half of it is left

@@ -8,13 +8,16 @@ import math
 import platform
 import subprocess
 import sys
+import tempfile
 import time
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+import yaml
 from filelock import FileLock, Timeout
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 from torchrl.record.loggers.tensorboard import TensorboardLogger
 
 from pace.config.base import ConfigError
@@ -39,6 +42,21 @@ def default_folder(name: str) -> Path:
     while candidate.exists():
         candidate, number = base.with_name(f"{base.name}_{number}"), number + 1
     return candidate
+
+
+def make_out(out: str | None, name: str) -> Path:
+    """The folder that a command writes: ``out``, or a new :func:`default_folder`. Made before the work begins.
+
+    Errors: :class:`ConfigError` for one that cannot be made or written.
+    """
+    folder = Path(out) if out else default_folder(name)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise ConfigError(f"out={folder} cannot be written: {error.strerror}; give another out=") from error
+    return folder
 
 
 def versions() -> dict[str, Any]:
@@ -93,10 +111,8 @@ class RunFolder:
 
     def _claim(self, first_update: int) -> None:
         """Make the folder, which must not hold a checkpoint that is newer than the run's."""
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise ConfigError(f"out={self.path} cannot be made: {error.strerror}") from error
+        make_out(str(self.path), "")
+        self._require_own()
         self._lock = FileLock(self.path / LOCK)  # the system releases it when the process ends, for whatever reason
         try:
             self._lock.acquire(timeout=0)
@@ -110,6 +126,17 @@ class RunFolder:
                 f"{self.path} has a checkpoint of update {last}: resume={self.path} continues it; "
                 "or give another out=, or move it away"
             )
+
+    def _require_own(self) -> None:
+        """The files that a run replaces must be a run's. Errors: :class:`ConfigError` for somebody else's."""
+        config, metrics = self.path / CONFIG, self.path / METRICS
+        ours = [
+            not config.exists() or {"robot", "algo"} <= set(_keys(config)),
+            not metrics.exists() or metrics.read_text().partition("\n")[0].startswith("update,"),
+        ]
+        for file, own in zip((config, metrics), ours, strict=True):
+            if not own:
+                raise ConfigError(f"{file} is no file of a run, and is not replaced: give another out=")
 
     @property
     def metrics_file(self) -> Path:
@@ -197,3 +224,12 @@ def plot_learning_curve(run: str | Path) -> Path | None:
     file = Path(run) / CURVE
     figure.savefig(file, dpi=110)
     return file
+
+
+def _keys(file: Path) -> list[str]:
+    """Top-level keys of a YAML file; none if it is no mapping."""
+    try:
+        loaded = OmegaConf.load(file)
+    except (OSError, ValueError, yaml.YAMLError, OmegaConfBaseException):
+        return []
+    return [str(key) for key in loaded] if isinstance(loaded, DictConfig) else []

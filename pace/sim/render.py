@@ -105,7 +105,7 @@ class SceneRenderer:
         self._gl.free()
 
     def set_state(self, qpos: NDArray[np.floating], ball: NDArray[np.floating]) -> None:
-        """Set robot qpos (28,) and ball position (3,) m of the next pictures."""
+        """Set robot qpos (7 + J,) and ball position (3,) m of the next pictures."""
         self.data.qpos[:] = qpos
         self.data.mocap_pos[0] = ball
         mujoco.mj_kinematics(self.model, self.data)

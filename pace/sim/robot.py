@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pace.config.base import ConfigError
 from pace.config.sim import EngineConfig, JointGroup, RobotConfig, TableConfig
-from pace.sim.robot_spec import RobotSpec, model_path, read_scene
+from pace.sim.robot_spec import PADDLE, RobotSpec, model_path, read_scene
 
 #: Name of the keyframe: nominal pose, soles on the floor.
 NOMINAL_KEY = "nominal"
@@ -135,10 +135,12 @@ def _fit_table(spec: mujoco.MjSpec, table: TableConfig) -> None:
     for name, (size, pos) in boxes.items():
         spec.geom(name).size = size
         spec.geom(name).pos = pos
-    spec.geom("paddle").size[:2] = (table.paddle_radius, table.paddle_half_thickness)
+    spec.geom(PADDLE).size[:2] = (table.paddle_radius, table.paddle_half_thickness)
     for name, side in (("paddle_front", 1), ("paddle_back", -1)):
-        spec.geom(name).size[:2] = (table.paddle_radius - 0.0005, 0.001)
-        spec.geom(name).pos[0] = side * (table.paddle_half_thickness - 0.0007)
+        geom = spec.geom(name)
+        if geom is not None:  # for the eye only; a robot may do without
+            geom.size[:2] = (table.paddle_radius - 0.0005, 0.001)
+            geom.pos[0] = side * (table.paddle_half_thickness - 0.0007)
 
 
 def _standing(model: mujoco.MjModel, pose: NDArray[np.float64], soles: Sequence[str]) -> NDArray[np.float64]:

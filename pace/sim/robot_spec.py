@@ -19,6 +19,9 @@ ASSETS = Path(__file__).parent / "assets"
 #: Suffix of the sensors that count the contacts of a geom.
 TOUCH = "_touch"
 FEET = 2  # left and right
+#: Groups of joints that reward terms sum over (``pace.task.state_kernels``); a robot may lack some.
+GROUPS = ("ankles", "hip_waist_left_arm", "left_shoulder_roll", "right_arm")
+PADDLE = "paddle"  # geom of the blade, a cylinder
 
 
 @dataclass(frozen=True)
@@ -113,6 +116,10 @@ def _parts(path: Path) -> Parts:
     moved = tuple(actuator.target for actuator in spec.actuators)
     if moved != joints:
         raise ConfigError(f"robot.model {path}: every joint needs one actuator, in the order of the joints")
+    if spec.geom(PADDLE) is None:
+        raise ConfigError(f"robot.model {path}: the blade must be a geom named {PADDLE}")
+    if any(name.endswith(TOUCH) for name in sensors[:FEET]) or len(contacts) + FEET != len(sensors):
+        raise ConfigError(f"robot.model {path}: its sensors must be the force on each foot, then NAME{TOUCH} of geoms")
     return Parts(joints, tuple(site.name for site in spec.sites), contacts)
 
 
@@ -122,6 +129,9 @@ def _check(robot: RobotConfig, found: Parts) -> None:
         missing = [name for name in names if name not in found.sites]
         if missing:
             raise ConfigError(f"robot.{key}: {robot.model} has no site {', '.join(missing)}")
+    unsummed = sorted(set(robot.groups) - set(GROUPS))
+    if unsummed:
+        raise ConfigError(f"robot.groups: no reward term sums over {', '.join(unsummed)}; known: {', '.join(GROUPS)}")
     for key, parts in {"arm": robot.arm, **{f"groups.{name}": parts for name, parts in robot.groups.items()}}.items():
         unknown = [part for part in parts if not _matching(found.joints, [part])]
         if unknown:

@@ -19,7 +19,7 @@ from pace.config.base import parse
 from pace.config.commands import AblateConfig
 from pace.runs.metrics import MILESTONES, Array, Curve, Milestone, markdown, passage, read_curve, write_slim
 from pace.runs.queue import Run, RunQueue, check_settings
-from pace.runs.run_folder import METRICS
+from pace.runs.run_folder import METRICS, make_out
 
 DPI = 110
 COLOURS, DASHES = 10, ("-", "--", ":")  # of the figure: the next dash after the last colour
@@ -38,7 +38,7 @@ def ablate_from_config(composed: DictConfig) -> None:
     Errors: :class:`AblationError`, at the end, if runs failed.
     """
     config = parse(composed, AblateConfig)
-    out = Path(config.out)
+    out = make_out(config.out, "ablation")
     failures: Mapping[str, str] = {}
     if config.train:
         failures = train(config, out)
@@ -82,7 +82,6 @@ def train(config: AblateConfig, out: Path) -> Mapping[str, str]:
     except KeyboardInterrupt:
         print(f"\nto resume: the same command; finished and saved runs are in {config.out}", file=sys.stderr)
         raise
-    out.mkdir(parents=True, exist_ok=True)
     for run in runs:
         if (run.folder / METRICS).exists():
             print(f"wrote {write_slim(run.folder / METRICS, out / f'{run.name}.csv')}")

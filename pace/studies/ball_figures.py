@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import fields
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -18,7 +17,7 @@ from torch import Tensor
 from pace.arrays.launch import Launch
 from pace.config.base import parse
 from pace.config.commands import ValidateConfig
-from pace.runs.run_folder import default_folder
+from pace.runs.run_folder import make_out
 from pace.sim.ball.ball import BallParams, BallSim, Forecast, ball_preset
 from pace.sim.ball.rebound import Material, rebound
 from pace.studies import ball_reference as reference
@@ -220,8 +219,7 @@ def print_speed(num_worlds: int = 1024) -> None:
 def validate_from_config(composed: DictConfig) -> None:
     """Draw the figures into the configured folder, and print the numbers."""
     config = parse(composed, ValidateConfig)
-    out = Path(config.out) if config.out else default_folder("validate")
-    out.mkdir(parents=True, exist_ok=True)
+    out = make_out(config.out, "validate")
     save_figure(out / "flight_error.png", (9, 3.4), draw_flight_errors)
     save_figure(out / "rebound.png", (9, 3.4), draw_rebound)
     save_figure(out / "presets.png", (7.5, 5.4), draw_presets)

@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 from pace.config.base import meant, parse, require
 from pace.config.commands import StudiesConfig
 from pace.rl.policies import load_predictor
-from pace.runs.run_folder import default_folder
+from pace.runs.run_folder import make_out
 from pace.studies import (
     adaptation,
     architecture,
@@ -173,9 +173,8 @@ def study_from_config(composed: DictConfig) -> None:
         run=Path(config.run) if config.run else None,
         cases=config.cases,
         predictors=[Path(path) for path in config.predictors],
-        out=Path(config.out) if config.out else default_folder("studies"),
+        out=make_out(config.out, "studies"),
     )
-    options.out.mkdir(parents=True, exist_ok=True)
     for name in names:
         print(f"\n== {name}")
         STUDIES[name](options)

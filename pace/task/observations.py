@@ -13,6 +13,7 @@ A group's observation (N, H * D) is its last H frames of D numbers, oldest first
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from functools import cache
 from itertools import accumulate
 from typing import NamedTuple, TypeVar
 
@@ -105,6 +106,7 @@ class PolicyObservations(Registry[ActorObservation]):
 
 
 def _part_of(estimate: str, part: str) -> ActorObservation:
+    @cache
     def where(joints: int) -> slice:
         return columns(ESTIMATES[estimate].make.parts(joints))[part]
 

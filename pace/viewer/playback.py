@@ -152,7 +152,7 @@ class Score:
 class Snapshot:
     """Everything to draw at one instant, world frame, m. ``flight_number`` counts the flight lines."""
 
-    qpos: Array  # (28,)
+    qpos: Array  # (7 + J,)
     ball: Array  # (3,)
     flight: Array  # (M, 3)
     flight_number: int

@@ -98,6 +98,7 @@ def test_its_policy_is_exported(folder: Path, run: Path) -> None:
         ("robot.arm=[Wing]", "robot.arm: no joint of t1_paddle.xml has Wing in its name"),
         ("robot.groups.ankles=[Fin]", "robot.groups.ankles: no joint of t1_paddle.xml has Fin in its name"),
         ("robot.foot_sites=[left_foot]", "must name a left and a right sole"),
+        ("+robot.groups.tail=[Waist]", "robot.groups: no reward term sums over tail"),
     ],
 )
 def test_a_part_that_is_not_there_is_one_clear_error(override: str, message: str) -> None:
@@ -109,3 +110,33 @@ def test_an_mjcf_that_is_none_is_one_clear_error(tmp_path: Path) -> None:
     (tmp_path / "broken.xml").write_text("<mujoco>")
     with pytest.raises(ConfigError, match=r"robot.model .*broken.xml: "):
         RobotSpec.of(load_train_config([f"robot.model={tmp_path / 'broken.xml'}"]).robot)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('<geom name="paddle" ', '<geom name="bat" ', "the blade must be a geom named paddle"),
+        (
+            '<contact name="right_foot_force"',
+            '<contact name="right_foot_touch"',
+            "its sensors must be the force on each",
+        ),
+    ],
+)
+def test_an_mjcf_without_a_needed_part_is_one_clear_error(tmp_path: Path, old: str, new: str, message: str) -> None:
+    xml = (ASSETS / "t1_paddle.xml").read_text()
+    assert old in xml
+    for name in ("geom1", "geom2"):  # what refers to the paddle
+        xml = xml.replace(f'{name}="paddle"', f'{name}="bat"') if "bat" in new else xml
+    (tmp_path / "odd.xml").write_text(xml.replace(old, new))
+    with pytest.raises(ConfigError, match=message):
+        RobotSpec.of(load_train_config([f"robot.model={tmp_path / 'odd.xml'}"]).robot)
+
+
+def test_the_colours_of_the_blade_are_optional(tmp_path: Path) -> None:
+    lines = (ASSETS / "t1_paddle.xml").read_text().splitlines()
+    (tmp_path / "plain.xml").write_text("\n".join(line for line in lines if 'name="paddle_front"' not in line))
+    config = load_train_config([f"robot.model={tmp_path / 'plain.xml'}"])
+    assert build_model(config.robot, config.engine, config.ball.table, visual=True).nu == len(
+        RobotSpec.of(config.robot).joints
+    )
