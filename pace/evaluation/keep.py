@@ -14,7 +14,7 @@ def main() -> int:
 
 
 def load() -> Work:
-    """The command's function and the errors that it may end with."""
+    """What the command does, and the errors that it may end with."""
     from pace.evaluation.publish import KeepError, keep_from_config
     from pace.runs.checkpoint import CheckpointError
 

@@ -14,7 +14,7 @@ def main() -> int:
 
 
 def load() -> Work:
-    """The command's function and the errors that it may end with."""
+    """What the command does, and the errors that it may end with."""
     from pace.rl.predictor_run import train_predictor
 
     return train_predictor, ()

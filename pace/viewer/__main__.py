@@ -14,7 +14,7 @@ def main() -> int:
 
 
 def load() -> Work:
-    """The command's function and the errors that it may end with."""
+    """What the command does, and the errors that it may end with."""
     from pace.runs.checkpoint import CheckpointError
     from pace.sim.render import RenderError
     from pace.viewer.play import play_from_config
