@@ -1,6 +1,6 @@
 """Torch tensors and Warp arrays on one memory: structs of arrays, launches by name, random samples, graphs, state.
 
-Tools that every kernel needs belong here; the kernels of one subject do not. Imports ``config`` and ``devices``."""
+Tools that every kernel needs belong here, not the kernels of one subject. Imports ``config`` and ``devices``."""
 
 import warp as wp
 

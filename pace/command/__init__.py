@@ -1,6 +1,6 @@
 """The command line: table of the commands, their help, and one-line errors for wrong input instead of a traceback.
 
-The common code of all commands belongs here; the work of each command is in its room. Imports ``config``, and no torch:
+The common code of all commands belongs here, not the work of one command. Imports ``config``, and no torch:
 ``--help`` and errors of wrong input appear at once.
 """
 

@@ -1,6 +1,6 @@
 """Typed configuration: the dataclasses of ``configs/``, and the check of YAML against them.
 
-The meaning, type and range of each key belong here; their use does not. Imports nothing of the package.
+The meaning, type and range of each key belong here, not their use. Imports nothing of the package.
 """
 
 from pace.config.base import ConfigError

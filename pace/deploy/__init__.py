@@ -1,5 +1,5 @@
 """Exporting a policy for a robot: its whole computation as one graph, and the ONNX file.
 
-The exported file belongs here; the estimators that it computes (``onboard``) do not. Imports ``rl`` and the rooms
+The exported file belongs here, not the estimators that it computes (``onboard``). Imports ``rl`` and the rooms
 below. ``python -m pace.deploy RUN`` exports.
 """

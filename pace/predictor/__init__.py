@@ -1,6 +1,6 @@
 """Predicting the ball: the physics-based forecast, and the learned network behind the policy's observations.
 
-Forecasts of the ball and the network's regression belong here; the robot's use of them (``onboard``) does not. Imports
+Forecasts of the ball and the network's regression belong here, not the robot's use of them (``onboard``). Imports
 ``sim`` and the rooms below. ``python -m pace.predictor`` trains the network alone.
 """
 

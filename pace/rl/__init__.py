@@ -1,6 +1,6 @@
 """Learning a policy: networks, rollouts, PPO, the training loop, and loading a trained policy.
 
-The learner belongs here; the task that it learns (``task``) and its evaluation (``evaluation``) do not. Imports
+The learner belongs here, not the task (``task``) and not its evaluation (``evaluation``). Imports
 ``task``, ``predictor``, ``runs`` and the rooms below. ``python -m pace.rl.train`` trains.
 """
 

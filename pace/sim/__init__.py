@@ -1,6 +1,6 @@
 """Physics of N table-tennis worlds: the robot, the ball and the robot's sensors. Knows nothing of learning.
 
-The state of the world and its sensors belong here; the robot's task does not. Imports ``arrays`` and the rooms below.
+The state of the world and its sensors belong here, not the robot's task. Imports ``arrays`` and the rooms below.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Table tennis as a task: the environment, its referee, resets, observations, rewards and statistics.
 
-The robot's task and its observations belong here; learning does not. Imports ``onboard`` and the rooms below.
+The robot's task and its observations belong here, not learning. Imports ``onboard`` and the rooms below.
 """
 
 from __future__ import annotations

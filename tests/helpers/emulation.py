@@ -27,8 +27,8 @@ class OnGpu(Tensor):
 
 
 def take_the_gpus_way(env: TableTennisEnv) -> None:
-    """Where the masks lie on a CPU, three places look which worlds begin anew, to do less work, and the solver whether
-    all worlds have converged; on a GPU none does."""
+    """With masks on a CPU, three places read which worlds restart, to do less work, and the solver checks whether
+    all worlds have converged; on a GPU none does this."""
 
     def on_gpu(function: Any, place: int) -> Any:
         return lambda *args: function(*args[:place], args[place].as_subclass(OnGpu), *args[place + 1 :])

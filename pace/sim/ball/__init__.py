@@ -1,7 +1,7 @@
 """The ball: its flight through the air, its rebounds, and the forecast of both.
 
 Public names: :class:`BallParams` (with ``preset``), :class:`BallSim`, :class:`Forecast`. The ball's motion belongs
-here; the rules of the game (``task``) do not. Imports ``arrays`` and the rooms below.
+here, not the rules of the game (``task``). Imports ``arrays`` and the rooms below.
 """
 
 from pace.sim.ball.ball import BallParams, BallSim, Forecast, ball_preset

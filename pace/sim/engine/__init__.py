@@ -1,5 +1,5 @@
 """The robot's physics: one protocol, and the engines behind it.
 
-Stepping joints and bodies belongs here; the ball, which has a separate kernel (``sim.ball``), does not. Imports
+Stepping joints and bodies belongs here, not the ball, which has a separate kernel (``sim.ball``). Imports
 ``sim.robot``, ``arrays`` and the rooms below; ``sim.worlds`` imports it.
 """
