@@ -215,6 +215,7 @@ def test_the_filter_of_the_whole_flight_is_exported_for_any_number_of_robots(tmp
     assert max(export_policy(policy, tmp_path / "policy.onnx", options("check_steps=40")).values()) < 1e-4
 
 
+@pytest.mark.slow
 def test_returns_are_seen_while_it_is_compared(remembering: tuple[Path, TaskPolicy, dict[str, float]]) -> None:
     """Serves are returned in the recorded observations, and what is remembered of them changes the action."""
     file, policy, _ = remembering
@@ -293,6 +294,7 @@ def test_the_example_gives_the_targets_of_the_task(exported: tuple[Path, dict[st
     assert follow(example.Controller(exported[0]), load_policy(exported[0].parent)) > 0
 
 
+@pytest.mark.slow
 def test_the_example_remembers_its_returns(
     remembering: tuple[Path, TaskPolicy, dict[str, float]], example: Any
 ) -> None:

@@ -43,6 +43,7 @@ def test_a_limp_arm_takes_the_impulse_as_a_free_mass_would(strikes: reaction.Str
     assert 0 < reaction.cost(num_worlds=4, repeats=3) < 0.1
 
 
+@pytest.mark.slow
 def test_engines_agree_for_a_second_within_the_stated_tolerances(found: Found) -> None:
     for scenario, others in found.items():
         d = others["mjwarp"]
