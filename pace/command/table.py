@@ -127,7 +127,9 @@ COMMANDS = {
             "train=false out=docs/results/recipe     # table and figure again, from the CSVs",
         ),
         groups=tuple(group for group in TRAIN_GROUPS if group != "experiment"),
-        training_keys=("num_worlds", "processes", "device", "curriculum", "checkpoint_minutes", "tensorboard", "plugins"),
+        training_keys=(
+            "num_worlds", "processes", "device", "curriculum", "checkpoint_minutes", "tensorboard", "plugins",
+        ),  # fmt: skip
         collected=True,
         refused={"experiment": "experiments= names them", "seed": "seeds= lists them", "minutes": "samples= ends runs"},
     ),

@@ -56,7 +56,7 @@ class ExportError(RuntimeError):
 def export_from_config(composed: DictConfig) -> None:
     """Export as the composed configuration says; print what was written and how well it agrees with torch."""
     config = parse(composed, ExportConfig)
-    assert config.run is not None  # ExportConfig has seen to it
+    assert config.run is not None  # guaranteed by ExportConfig
     policy = load_policy(config.run)
     if config.out and Path(config.out).suffix == ".onnx":
         raise ExportError(f"out={config.out} must be a folder, in which policy.onnx is written")

@@ -3,7 +3,7 @@
 Position, velocity and acceleration of each axis are fitted to every sensed position before the bounce. A second fit
 covers the positions after it, starting from the first parabola's position and velocity at the table. Launch, gravity,
 drag and the table are priors, as wide as the variation over serves and balls; the network after the fit learns the
-residual. The serve's priors come from the configuration (:class:`pace.config.predictor.PredictorPriors`). Only positions are
+residual. The serve's priors come from the configuration (``PredictorPriors``). Only positions are
 used, so a window over the whole flight is the entire state.
 """
 

@@ -157,6 +157,7 @@ def test_comments_belong_to_their_keys(tmp_path: Path) -> None:
         (("train", "minutes", "=3"), "write minutes=3, without spaces"),
         (("train", "minutes"), "'minutes' is no key=value"),
         (("train", "serve.vx=-5"), "'serve.vx': needs a list"),
+        (("train", "plugins=my_module"), "write plugins=[my_module]"),
         (("train", "run_dir=runs/x"), "run_dir= is now out="),
         (("ablate", "run_dir=runs/x"), "run_dir= is now out="),
         (("ablate", "experiment=paper"), "experiments= names them"),

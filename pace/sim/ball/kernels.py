@@ -13,7 +13,7 @@ from pace.sim.ball.paddle import paddle_centre, paddle_speed_bound
 from pace.sim.ball.scene import FLOOR, NOTHING, STATIC_SURFACES, Scene, read_body
 from pace.sim.ball.state import BallArrays, EventArrays, ForecastArrays
 
-#: s, the forecast looks no further ahead; a ball that rolls on the table would go on for ever.
+#: s; the forecast ends there, because a ball may roll on the table without end.
 FORECAST_HORIZON = 3.0
 # Sub-steps after which a control step or a forecast is given up: only a state that is not finite takes so many.
 _MAX_LEGS = wp.constant(1024)

@@ -1,0 +1,67 @@
+"""Folders that commands write: made and checked before the work, and nobody else's files are replaced."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from pace.bench.__main__ import main as bench
+from pace.config.base import ConfigError
+from pace.evaluation.__main__ import main as evaluate
+from pace.rl.train import main as train
+from pace.runs.run_folder import RunFolder, make_out
+from pace.studies.__main__ import main as studies
+from pace.studies.ablate import main as ablate
+from tests.helpers.outside import SMALL, command
+
+
+def test_a_folder_is_made_and_nothing_is_left_in_it(tmp_path: Path) -> None:
+    assert list(make_out(str(tmp_path / "a" / "b"), "x").iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("main", "arguments"),
+    [
+        (evaluate, ("pretrained/pace", "rows=[mixed]", "serves=100000000")),
+        (bench, ("bench=quick",)),
+        (ablate, ("samples=1e12",)),
+        (studies, ("all",)),
+        (train, ("samples=1e12", "processes=1")),
+    ],
+)
+def test_an_out_that_cannot_be_a_folder_ends_in_one_line_before_the_work(
+    main, arguments: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "taken").write_text("mine")
+    assert command(main, *arguments, f"out={tmp_path / 'taken'}") == 2
+    error = capsys.readouterr().err
+    assert f"out={tmp_path / 'taken'} cannot be written: File exists" in error
+    assert "Traceback" not in error
+    assert (tmp_path / "taken").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [("config.yaml", "my: own settings\n"), ("config.yaml", "- a\n- list\n"), ("config.yaml", "{"),
+     ("metrics.csv", "day,weight\n1,70\n")],
+)  # fmt: skip
+def test_a_run_replaces_no_file_that_is_not_a_runs(name: str, text: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(ConfigError, match=f"{name} is no file of a run, and is not replaced"):
+        RunFolder(tmp_path, {"robot": {}, "algo": {}}, tensorboard=False)
+    assert (tmp_path / name).read_text() == text
+    assert {file.name for file in tmp_path.iterdir()} <= {name, ".lock"}
+
+
+def test_a_run_may_begin_again_in_its_own_folder(tmp_path: Path) -> None:
+    for _ in range(2):
+        run = RunFolder(tmp_path, {"robot": {}, "algo": {}}, tensorboard=False)
+        run.log({"update": 1.0})
+        run.close()
+
+
+def test_the_command_names_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "metrics.csv").write_text("day,weight\n1,70\n")
+    assert command(train, f"out={tmp_path}", *SMALL) == 2
+    assert f"{tmp_path / 'metrics.csv'} is no file of a run" in capsys.readouterr().err
