@@ -128,8 +128,14 @@ COMMANDS = {
         ),
         groups=tuple(group for group in TRAIN_GROUPS if group != "experiment"),
         training_keys=(
-            "num_worlds", "processes", "device", "curriculum", "checkpoint_minutes", "tensorboard", "plugins",
-        ),  # fmt: skip
+            "num_worlds",
+            "processes",
+            "device",
+            "curriculum",
+            "checkpoint_minutes",
+            "tensorboard",
+            "plugins",
+        ),
         collected=True,
         refused={"experiment": "experiments= names them", "seed": "seeds= lists them", "minutes": "samples= ends runs"},
     ),
@@ -174,10 +180,28 @@ COMMANDS = {
         "result by init_from=RUN or predictor_from=RUN.",
         examples=("predictor=paper sensing=clean samples=2e6", "predictor=filter randomization=wide minutes=4"),
         groups=(
-            "robot", "ball", "serve", "reward", "randomization", "sensing", "engine", "algo", "predictor", "experiment",
+            "robot",
+            "ball",
+            "serve",
+            "reward",
+            "randomization",
+            "sensing",
+            "engine",
+            "algo",
+            "predictor",
+            "experiment",
         ),
         training_keys=(
-            "name", "num_worlds", "device", "seed", "samples", "minutes", "out", "tensorboard", "progress", "plugins",
+            "name",
+            "num_worlds",
+            "device",
+            "seed",
+            "samples",
+            "minutes",
+            "out",
+            "tensorboard",
+            "progress",
+            "plugins",
         ),
     ),
     "studies": Command(
@@ -193,4 +217,4 @@ COMMANDS = {
         examples=("parity worlds=16", "steps solver run=pretrained/pace", "predictor serves=512 cases=[rubber]"),
         rest="studies",
     ),
-}  # fmt: skip
+}
