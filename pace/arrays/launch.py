@@ -64,6 +64,8 @@ class MaskedLaunch:
         self, kernel: wp.Kernel, dim: int | tuple[int, ...], device: torch.device, /, **arguments: Any
     ) -> None:
         count = dim if isinstance(dim, int) else dim[0]
+        if "mask" in arguments:
+            raise LaunchError(f"kernel '{kernel.key}': the argument 'mask' is given with each call, not here")
         self._mask = torch.zeros(count, dtype=torch.bool, device=device)
         self._some = Launch(kernel, dim, device, mask=self._mask, **arguments)
         everyone = torch.ones(count, dtype=torch.bool, device=device)
@@ -142,6 +144,9 @@ def _as_argument(where: str, declared: Any, value: Any, device: torch.device) ->
 def _as_struct(where: str, struct: Any, owner: Any, device: torch.device) -> Any:
     """A Warp struct on the memory of the tensors of the same names."""
     made = struct()
+    if isinstance(owner, Mapping) and set(owner) - set(struct.vars):
+        unknown = ", ".join(sorted(set(owner) - set(struct.vars)))
+        raise LaunchError(f"{where} has no field {unknown}; {struct.key} has {', '.join(struct.vars)}")
     known = owner if isinstance(owner, Mapping) else {name: getattr(owner, name, None) for name in struct.vars}
     for name, variable in struct.vars.items():
         if known.get(name) is None:

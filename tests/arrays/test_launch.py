@@ -188,3 +188,17 @@ def test_what_was_refused_is_refused_again() -> None:
     for _ in range(2):
         with pytest.raises(LaunchError):
             bound(wrong)
+
+
+def test_an_unknown_field_of_a_struct_is_named() -> None:
+    values, out = torch.ones(2), torch.zeros(2)
+    with pytest.raises(LaunchError, match="row has no field gian; .* has values, gain"):
+        table(Row, [{"values": values, "gain": 1.0, "gian": 2.0}], CPU)
+    rows = table(Row, [{"values": values, "gain": 2.0}], CPU)
+    Launch(_add_rows, 2, CPU, rows=rows, out=out)()
+    assert out.tolist() == [2.0, 2.0]
+
+
+def test_a_mask_is_given_with_each_call() -> None:
+    with pytest.raises(LaunchError, match="kernel '.*_scale.*': the argument 'mask' is given with each call"):
+        MaskedLaunch(_scale, 2, CPU, mask=torch.ones(2, dtype=torch.bool), factor=1.0)
