@@ -192,7 +192,7 @@ def test_what_was_refused_is_refused_again() -> None:
 
 def test_an_unknown_field_of_a_struct_is_named() -> None:
     values, out = torch.ones(2), torch.zeros(2)
-    with pytest.raises(LaunchError, match="row has no field gian; .* has values, gain"):
+    with pytest.raises(LaunchError, match=r"row has no field gian; .* has values, gain"):
         table(Row, [{"values": values, "gain": 1.0, "gian": 2.0}], CPU)
     rows = table(Row, [{"values": values, "gain": 2.0}], CPU)
     Launch(_add_rows, 2, CPU, rows=rows, out=out)()
@@ -200,5 +200,5 @@ def test_an_unknown_field_of_a_struct_is_named() -> None:
 
 
 def test_a_mask_is_given_with_each_call() -> None:
-    with pytest.raises(LaunchError, match="kernel '.*_scale.*': the argument 'mask' is given with each call"):
+    with pytest.raises(LaunchError, match=r"kernel '.*_scale.*': the argument 'mask' is given with each call"):
         MaskedLaunch(_scale, 2, CPU, mask=torch.ones(2, dtype=torch.bool), factor=1.0)
