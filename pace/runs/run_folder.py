@@ -25,6 +25,7 @@ from pace.config.upgrade import FORMAT
 from pace.runs.checkpoint import list_checkpoints
 from pace.runs.metrics import read_metrics
 
+STAMP = "# format: "  # begins the first line of a run's configuration
 LOCK = ".lock"
 CONFIG, VERSIONS, METRICS, CURVE = "config.yaml", "versions.json", "metrics.csv", "learning_curve.png"
 PACKAGES = ("torch", "torchrl", "tensordict", "mujoco", "mujoco-warp", "warp-lang", "numpy", "hydra-core")
@@ -52,10 +53,12 @@ def make_out(out: str | None, name: str) -> Path:
     folder = Path(out) if out else default_folder(name)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
     except OSError as error:
-        raise ConfigError(f"out={folder} cannot be written: {error.strerror}; give another out=") from error
+        raise ConfigError(f"out={folder} cannot be made: {error.strerror}") from error
+    try:
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise ConfigError(f"out={folder} cannot be written: {error.strerror}") from error
     return folder
 
 
@@ -103,7 +106,7 @@ class RunFolder:
     def __init__(self, path: str | Path, config: dict[str, Any], tensorboard: bool, first_update: int = 0) -> None:
         self.path = Path(path)
         self._claim(first_update)
-        (self.path / CONFIG).write_text(f"# format: {FORMAT}\n{OmegaConf.to_yaml(OmegaConf.create(config))}")
+        (self.path / CONFIG).write_text(f"{STAMP}{FORMAT}\n{OmegaConf.to_yaml(OmegaConf.create(config))}")
         (self.path / VERSIONS).write_text(json.dumps(versions(), indent=1))
         self._columns: list[str] = []
         self._file = self._open_metrics(first_update)
@@ -112,7 +115,6 @@ class RunFolder:
     def _claim(self, first_update: int) -> None:
         """Make the folder, which must not hold a checkpoint that is newer than the run's."""
         make_out(str(self.path), "")
-        self._require_own()
         self._lock = FileLock(self.path / LOCK)  # the system releases it when the process ends, for whatever reason
         try:
             self._lock.acquire(timeout=0)
@@ -120,6 +122,7 @@ class RunFolder:
             raise ConfigError(
                 f"{self.path} is in use by another process: end that first, or give another out="
             ) from error
+        self._require_own()
         last = max((int(folder.name.removeprefix("update_")) for folder in list_checkpoints(self.path)), default=0)
         if last > first_update:
             raise ConfigError(
@@ -131,8 +134,8 @@ class RunFolder:
         """The files that a run replaces must be a run's. Errors: :class:`ConfigError` for somebody else's."""
         config, metrics = self.path / CONFIG, self.path / METRICS
         ours = [
-            not config.exists() or {"robot", "algo"} <= set(_keys(config)),
-            not metrics.exists() or metrics.read_text().partition("\n")[0].startswith("update,"),
+            not config.exists() or _first_line(config).startswith(STAMP) or {"robot", "algo"} <= set(_keys(config)),
+            not metrics.exists() or metrics.stat().st_size == 0 or _first_line(metrics).startswith("update,"),
         ]
         for file, own in zip((config, metrics), ours, strict=True):
             if not own:
@@ -233,3 +236,12 @@ def _keys(file: Path) -> list[str]:
     except (OSError, ValueError, yaml.YAMLError, OmegaConfBaseException):
         return []
     return [str(key) for key in loaded] if isinstance(loaded, DictConfig) else []
+
+
+def _first_line(file: Path) -> str:
+    """The first line of a text file; nothing if it is no text."""
+    try:
+        with file.open() as text:
+            return text.readline()
+    except UnicodeDecodeError:
+        return ""

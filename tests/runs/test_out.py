@@ -36,7 +36,7 @@ def test_an_out_that_cannot_be_a_folder_ends_in_one_line_before_the_work(
     (tmp_path / "taken").write_text("mine")
     assert command(main, *arguments, f"out={tmp_path / 'taken'}") == 2
     error = capsys.readouterr().err
-    assert f"out={tmp_path / 'taken'} cannot be written: File exists" in error
+    assert f"out={tmp_path / 'taken'} cannot be made: File exists" in error
     assert "Traceback" not in error
     assert (tmp_path / "taken").read_text() == "mine"
 
