@@ -15,8 +15,8 @@ from pace.config.base import to_dict
 from pace.config.predictor import PredictorPriors
 from pace.config.renamed import with_current_names
 
-#: Format that this version writes. 1 is that of version 0.1.0 up to commit 43400ac.
-FORMAT = 2
+#: Format that this version writes. 1: version 0.1.0 up to commit 43400ac; 2: up to 72b96bb, before the world was made true.
+FORMAT = 3
 
 #: Landing target of a saved configuration without one (released configuration).
 LANDING_TARGET = (1.15, 0.0)  # m
