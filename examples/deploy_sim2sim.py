@@ -108,6 +108,38 @@ class Contact(NamedTuple):
     impulse: Vector
 
 
+class MeasuredAir:
+    """Drag and lift by speed and spin: shares of the tables under ``ball["air"]``.
+
+    Args: ball: as for :class:`Ball`; per_mass: 1/m, 1/2 rho A / m.
+    """
+
+    def __init__(self, ball: Mapping[str, Any], per_mass: float) -> None:
+        self._drag, self._lift = ball["air"]["drag"], ball["air"]["lift"]
+        self._radius = float(ball["radius"])
+        self._shares = per_mass * ball["table_drag"], 8.0 / 3.0 * per_mass * self._radius * ball["table_lift"]
+
+    def factors(self, speed: float, turning: float) -> tuple[float, float]:
+        """Drag (1/m) and lift (1) at ``speed`` m/s and a spin of ``turning`` rad/s."""
+        ratio = self._radius * turning / max(speed, 1e-3)
+        drags = [np.interp(ratio, row["ratio"], row["coefficient"]) for row in self._drag]
+        above = [np.polyval([row["quadratic"], row["linear"], row["constant"]], turning) for row in self._lift]
+        below = [row["slope"] * turning + row["offset"] for row in self._lift]
+        bends = [turning > row["bend"] for row in self._lift]
+        lifts = np.maximum(np.where(bends, above, below), 0.0)
+        drag = _by_speed(self._drag, drags, speed, beyond=True)
+        return self._shares[0] * max(drag, 0.0), self._shares[1] * _by_speed(self._lift, lifts, speed, beyond=False)
+
+
+def _by_speed(rows: list[Mapping[str, float]], values: Any, speed: float, beyond: bool) -> float:
+    """Linear between the rows' speeds, held beyond them; ``beyond``: extrapolated above the last."""
+    known = [row["speed"] for row in rows]
+    value = float(np.interp(speed, known, values))
+    if beyond and speed > known[-1]:
+        value += (speed - known[-1]) / (known[-1] - known[-2]) * (values[-1] - values[-2])
+    return value
+
+
 class Ball:
     """A ball with drag and Magnus force that rebounds from table, net, floor and a moving paddle.
 
@@ -121,8 +153,12 @@ class Ball:
         per_mass = 0.5 * ball["air_density"] * np.pi * self.radius**2 / self.mass
         self._drag = per_mass * ball["drag_coefficient"]
         self._magnus = per_mass * self.radius * ball["magnus_coefficient"]
+        self._air = MeasuredAir(ball, per_mass) if ball.get("air") else None  # none in files of before
         self._lowest = float(ball["min_restitution"])
         self.table: Mapping[str, float] = ball["table"]
+        springing = ("tangential_restitution", "tangential_restitution_slope", "drilling_loss")
+        self._springing = {"paddle": [ball.get(f"paddle_{name}", 0.0) for name in springing]}
+        self._springing["table"] = [ball.get("table_tangential_restitution", 0.0), 0.0, 0.0]
         self._materials = {  # restitution, its slope (s/m), friction
             "table": tuple(ball[f"table_{name}"] for name in ("restitution", "restitution_slope", "friction")),
             "paddle": tuple(ball[f"paddle_{name}"] for name in ("restitution", "restitution_slope", "friction")),
@@ -174,8 +210,11 @@ class Ball:
         self.velocity = self.velocity + dt * self._acceleration(middle)
 
     def _acceleration(self, velocity: Vector) -> Vector:
-        drag = -self._drag * np.sqrt(velocity @ velocity) * velocity
-        return GRAVITY + drag + self._magnus * _cross(self.spin, velocity)
+        speed = float(np.sqrt(velocity @ velocity))
+        drag, lift = self._drag, self._magnus
+        if self._air is not None:
+            drag, lift = np.add((drag, lift), self._air.factors(speed, float(np.sqrt(self.spin @ self.spin))))
+        return GRAVITY - drag * speed * velocity + lift * _cross(self.spin, velocity)
 
     def _gaps(self, position: Vector, blade: Blade | None) -> dict[str, tuple[float, Vector]]:
         """Gap (m, negative inside) and unit normal from each surface to the ball."""
@@ -187,7 +226,7 @@ class Ball:
         return {name: (distance - self.radius, normal) for name, (distance, normal) in gaps.items()}
 
     def _rebound(self, surface: str, blade: Blade) -> Contact:
-        """Impulse with Coulomb friction on a hollow sphere: it slides, or stops slipping."""
+        """Impulse with Coulomb friction on a hollow sphere: it slides, or its slip is stopped, or reversed by rubber."""
         _, normal = self._gaps(self.position, blade)[surface]
         point = self.position - self.radius * normal
         moving = blade.velocity + _cross(blade.rotation, point - blade.centre) if surface == "paddle" else np.zeros(3)
@@ -197,10 +236,14 @@ class Ball:
         push = (1.0 + max(restitution - slope * approach, self._lowest)) * approach
         slip = relative - self.radius * _cross(self.spin, normal)
         slip = slip - (slip @ normal) * normal
-        share = min(ROLLING, friction * push / max(float(np.sqrt(slip @ slip)), 1e-9))
+        slipping = float(np.sqrt(slip @ slip))
+        springing, falling, drilling = self._springing.get(surface, (0.0, 0.0, 0.0))
+        grip = ROLLING * (1.0 + max(springing - falling * slipping, -1.0))
+        share = min(grip, friction * push / max(slipping, 1e-9))
         change = push * normal - share * slip
         self.velocity = self.velocity + change
-        self.spin = self.spin + (1.5 / self.radius) * share * _cross(normal, slip)
+        turned = (1.5 / self.radius) * share * _cross(normal, slip) - drilling * (self.spin @ normal) * normal
+        self.spin = self.spin + turned
         if surface == "table":
             surface = "edge" if normal[2] <= 0.0 else "own" if self.position[0] < 0.0 else "opponent"
         return Contact(surface, self.position.copy(), point, -self.mass * change)

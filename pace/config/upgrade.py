@@ -15,11 +15,20 @@ from pace.config.base import to_dict
 from pace.config.predictor import PredictorPriors
 from pace.config.renamed import with_current_names
 
-#: Format that this version writes. 1: version 0.1.0 up to commit 43400ac; 2: up to 72b96bb, before the world was made true.
+#: Format that this version writes. 1: version 0.1.0 up to commit 43400ac; 2: up to 72b96bb, before the true world.
 FORMAT = 3
 
 #: Landing target of a saved configuration without one (released configuration).
 LANDING_TARGET = (1.15, 0.0)  # m
+
+#: Parameters of the ball that are sampled since format 3.
+NEW_BALL_SAMPLES = (
+    "table_drag",
+    "table_lift",
+    "table_tangential_restitution",
+    "paddle_tangential_restitution",
+    "paddle_drilling_loss",
+)
 
 Saved = dict[str, Any]
 Upgrade = tuple[int, Callable[[Saved], None]]
@@ -70,6 +79,22 @@ def store_the_predictors_priors(config: Saved) -> None:
         predictor["priors"] = to_dict(PredictorPriors())
 
 
+def name_the_first_reading(config: Saved) -> None:
+    """Presets whose rubber was read wrongly, and has no tangential restitution, are not those of the same name now."""
+    ball = _entry(config, "ball")
+    if ball.get("name") in ("rubber", "standard", "venue") and "paddle_tangential_restitution" not in ball:
+        ball["name"] += "_first_reading"
+
+
+def add_what_rubber_and_air_sample(state: Saved) -> None:
+    """A world's samples of ``ball`` that did not exist: no tangential restitution, constant coefficients of the air."""
+    for process in state["processes"]:
+        env = process["env"]
+        rows = env["worlds.drawn.ball.mass"]
+        for name in NEW_BALL_SAMPLES:
+            env.setdefault(f"worlds.drawn.ball.{name}", rows.new_zeros(rows.shape))
+
+
 def _entry(config: Any, *keys: str) -> Saved:
     """The dictionary under ``keys``; a new empty one if there is none."""
     for key in keys:
@@ -84,10 +109,11 @@ CONFIG_UPGRADES: list[Upgrade] = [
     (2, name_the_robots_parts),
     (2, move_the_landing_target),
     (2, store_the_predictors_priors),
+    (3, name_the_first_reading),
 ]
 #: (format that it makes, function of the training state: ``ppo``, ``regression`` and ``processes``, each of them with
 #: ``env`` and ``random``). Tensors are in their places.
-STATE_UPGRADES: list[Upgrade] = []
+STATE_UPGRADES: list[Upgrade] = [(3, add_what_rubber_and_air_sample)]
 
 
 def upgrade_config(config: Saved, version: int) -> Saved:

@@ -47,6 +47,7 @@ class ServePractice:
             config.robot.control_dt,
             1,
             config.engine.ball_dt,
+            config.ball.air,
         )
         self._randomizer = self._make_randomizer()
         self._serves = ServeSampler(config.serve, count, self.generator, device)

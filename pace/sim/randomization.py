@@ -36,9 +36,20 @@ SAMPLED_BALL_PARAMS = {
     "table_friction": ("table_friction", False),
     "paddle_restitution": ("paddle_restitution", False),
     "paddle_friction": ("paddle_friction", False),
+    "table_drag": ("drag_scale", True),
+    "table_lift": ("lift_scale", True),
+    "table_tangential_restitution": ("table_tangential_restitution", False),
+    "paddle_tangential_restitution": ("paddle_tangential_restitution", False),
+    "paddle_drilling_loss": ("paddle_drilling_loss", False),
 }
 #: Restitution above one would create energy; friction below zero would too.
-BALL_LIMITS = {"table_restitution": (0.0, 1.0), "paddle_restitution": (0.0, 1.0)}
+BALL_LIMITS = {
+    "table_restitution": (0.0, 1.0),
+    "paddle_restitution": (0.0, 1.0),
+    "table_tangential_restitution": (-1.0, 1.0),
+    "paddle_tangential_restitution": (-1.0, 1.0),
+    "paddle_drilling_loss": (0.0, 1.0),
+}
 
 
 @wp.kernel

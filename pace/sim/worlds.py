@@ -123,6 +123,7 @@ class Worlds(Stateful):
             self.control_dt,
             config.substeps,
             config.engine.ball_dt,
+            config.ball.air,
         )
         self.randomizer = Randomizer(
             config.randomization,

@@ -1,7 +1,8 @@
 """Independent reference solutions for the ball's kernels: NumPy in double precision, SciPy (extra ``dev``).
 
-This module shares no code with the kernels. A batch of flights is one system of equations for DOP853 at 1e-10. The time
-of each flight is scaled to [0, 1], and an event is found by Newton's method on its duration, without interpolation.
+This module shares no code with the kernels, only the tables of ``configs/ball``. A batch of flights is one system of
+equations for DOP853 at 1e-8. The time of each flight is scaled to [0, 1], and an event is found by Newton's method on
+its duration, without interpolation.
 """
 
 from __future__ import annotations
@@ -15,13 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
+from pace.config.sim import AirConfig
+from pace.sim.ball.ball import ball_preset
+
 T = TypeVar("T")
 Array = NDArray[np.float64]
 #: Value and rate of an event's function, from position and velocity (N, 3).
 Condition = Callable[[Array, Array], tuple[Array, Array]]
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
-TOLERANCE = 1.0e-10
+TOLERANCE = 1.0e-8  # relative and absolute; the bends of the tables make a smaller one costly
 
 
 @dataclass(frozen=True)
@@ -36,14 +40,59 @@ class ReferenceBall:
     table_restitution: Array
     table_restitution_slope: Array
     table_friction: Array
+    table_drag: Array
+    table_lift: Array
+    table_tangential_restitution: Array
 
     def acceleration(self, velocity: Array, spin: Array) -> Array:
-        """(N, 3) m/s^2 from the forces -1/2 rho C_d A |v| v and 1/2 rho A r C_m (omega x v)."""
+        """(N, 3) m/s^2 from the forces -1/2 rho C_d A |v| v and (1/2 rho A r C_m + rho V C_M) (omega x v)."""
         pressure = 0.5 * self.air_density * np.pi * self.radius**2
-        speed = np.linalg.norm(velocity, axis=1)
-        drag = -(pressure * self.drag_coefficient * speed)[:, None] * velocity
-        lift = (pressure * self.radius * self.magnus_coefficient)[:, None] * np.cross(spin, velocity)
-        return GRAVITY + (drag + lift) / self.mass[:, None]
+        speed, turning = np.linalg.norm(velocity, axis=1), np.linalg.norm(spin, axis=1)
+        ratio = self.radius * turning / np.maximum(speed, 1.0e-3)
+        drag_coefficient = self.drag_coefficient + self.table_drag * measured_drag(speed, ratio)
+        volume = 4.0 / 3.0 * np.pi * self.radius**3
+        lift_factor = pressure * self.radius * self.magnus_coefficient
+        lift_factor = lift_factor + self.air_density * volume * self.table_lift * measured_lift(speed, turning)
+        drag = -(pressure * drag_coefficient * speed)[:, None] * velocity
+        return GRAVITY + (drag + lift_factor[:, None] * np.cross(spin, velocity)) / self.mass[:, None]
+
+
+def measured_drag(speed: Array, ratio: Array) -> Array:
+    """C_d of ``configs/ball/_air.yaml`` (N,): linear in both, held below the rows, extrapolated above them."""
+    rows = _air().drag
+    by_row = np.stack([np.interp(ratio, row.ratio, row.coefficient) for row in rows])
+    found = _between([row.speed for row in rows], by_row, speed)
+    beyond = np.maximum(speed - rows[-1].speed, 0.0) / (rows[-1].speed - rows[-2].speed)
+    return np.maximum(found + beyond * (by_row[-1] - by_row[-2]), 0.0)
+
+
+def measured_lift(speed: Array, turning: Array) -> Array:
+    """C_M of ``configs/ball/_air.yaml`` (N,): linear in speed, held beyond the rows."""
+    rows = _air().lift
+    by_row = [
+        np.where(
+            turning <= row.bend,
+            row.slope * turning + row.offset,
+            np.polyval([row.quadratic, row.linear, row.constant], turning),
+        )
+        for row in rows
+    ]
+    return _between([row.speed for row in rows], np.maximum(by_row, 0.0), speed)
+
+
+def _between(speeds: list[float], by_row: Array, speed: Array) -> Array:
+    """Each column of ``by_row`` (rows, N) at its ``speed`` (N,), by interpolation."""
+    known, every = np.array(speeds), np.arange(len(speed))
+    above = np.clip(np.searchsorted(known, speed), 1, len(known) - 1)
+    share = np.clip((speed - known[above - 1]) / (known[above] - known[above - 1]), 0.0, 1.0)
+    return (1.0 - share) * by_row[above - 1, every] + share * by_row[above, every]
+
+
+@lru_cache(maxsize=1)
+def _air() -> AirConfig:
+    air = ball_preset("rubber").air
+    assert air is not None
+    return air
 
 
 def fly_for(ball: ReferenceBall, position: Array, velocity: Array, spin: Array, duration: Array) -> tuple[Array, Array]:
@@ -70,7 +119,7 @@ def fly_until(
         end_position, end_velocity = fly_for(ball, position, velocity, spin, duration)
         value, rate = condition(end_position, end_velocity)
         duration = duration - value / rate
-        if np.abs(value / rate).max() < 1.0e-9:
+        if np.abs(value / rate).max() < 1.0e-6:
             return duration, *fly_for(ball, position, velocity, spin, duration)
     raise RuntimeError("an event of a reference flight was not found in 20 Newton steps")
 
@@ -83,11 +132,12 @@ def rebound(
     radius: Array,
     restitution: Array,
     friction: Array,
+    tangential: Array | float = 0.0,
 ) -> tuple[Array, Array]:
     """Velocity and spin (N, 3) of approaching hollow spheres after an impulse, from the balance of momentum.
 
-    Per unit of mass: the normal impulse reverses the approach with ``restitution``; the friction impulse stops the slip
-    of the contact, and is at most ``friction`` times the normal impulse.
+    Per unit of mass: the normal impulse reverses the approach with ``restitution``; the friction impulse reverses the
+    slip of the contact with ``tangential``, and is at most ``friction`` times the normal impulse.
     """
     inertia = 2.0 / 3.0 * radius**2
     arm = -radius[:, None] * normal
@@ -96,7 +146,7 @@ def rebound(
     slip = relative + approach[:, None] * normal
     slip_speed = np.linalg.norm(slip, axis=1)
     push = (1.0 + restitution) * approach
-    stopping = slip_speed / (1.0 + radius**2 / inertia)
+    stopping = (1.0 + tangential) * slip_speed / (1.0 + radius**2 / inertia)
     grip = np.minimum(stopping, friction * push)
     direction = -slip / np.maximum(slip_speed, 1.0e-300)[:, None]
     impulse: Array = push[:, None] * normal + grip[:, None] * direction
@@ -128,7 +178,8 @@ def fly_serve(
     bounce_time, bounce, arriving = fly_until(ball, position, velocity, spin, on_table, ballistic)
     up = np.tile([0.0, 0.0, 1.0], (len(position), 1))
     restitution = ball.table_restitution + ball.table_restitution_slope * arriving[:, 2]
-    after, after_spin = rebound(arriving, spin, up, np.zeros_like(up), ball.radius, restitution, ball.table_friction)
+    contact = (ball.radius, restitution, ball.table_friction, ball.table_tangential_restitution)
+    after, after_spin = rebound(arriving, spin, up, np.zeros_like(up), *contact)
 
     def level(_position: Array, velocity: Array) -> tuple[Array, Array]:
         return velocity[:, 2], ball.acceleration(velocity, after_spin)[:, 2]
@@ -154,17 +205,26 @@ def _rows(table: T, chosen: NDArray[np.intp]) -> T:
     return type(table)(**columns)
 
 
+def _single(values: Array) -> Array:
+    """The values, exact in float32."""
+    return values.astype(np.float32).astype(np.float64)
+
+
 def _random_ball(uniform: Callable[..., Array]) -> ReferenceBall:
-    """Parameters wider than all presets."""
+    """Parameters wider than all presets: of the air constant coefficients, the measured ones, and anything between."""
+    drag, lift = uniform(0.0, 1.0), uniform(0.0, 1.0)
     return ReferenceBall(
         mass=uniform(0.0025, 0.0037),
         radius=uniform(0.019, 0.021),
         air_density=uniform(1.0, 1.3),
-        drag_coefficient=uniform(0.35, 0.6),
-        magnus_coefficient=uniform(0.0, 1.0),
+        drag_coefficient=_single((1.0 - drag) * uniform(0.35, 0.6)),
+        magnus_coefficient=_single((1.0 - lift) * uniform(0.0, 1.0)),
         table_restitution=uniform(0.85, 0.98),
         table_restitution_slope=uniform(0.0, 0.02),
         table_friction=uniform(0.05, 0.5),
+        table_drag=drag,
+        table_lift=lift,
+        table_tangential_restitution=uniform(-0.2, 0.8),
     )
 
 
@@ -178,7 +238,7 @@ def random_serves(count: int, seed: int = 0) -> ServeBatch:
     samples = count + count // 2 + 10
 
     def uniform(low: float, high: float, *shape: int) -> Array:
-        return rng.uniform(low, high, (samples, *shape)).astype(np.float32).astype(np.float64)
+        return _single(rng.uniform(low, high, (samples, *shape)))
 
     ball = _random_ball(uniform)
     position = np.stack([uniform(1.2, 1.5), uniform(-0.2, 0.2), uniform(0.95, 1.15)], axis=1)

@@ -101,7 +101,7 @@ def phase_spread(substeps: int, strikes: int = 100, phases: int = 20) -> tuple[A
     """
     count = strikes * phases
     meetings = random_meetings(strikes).repeated(phases)
-    values = (IN_AIR.mass, 0.02, 1.225, 0.47, 0.5, 0.9, 0.0, 0.25)
+    values = (IN_AIR.mass, 0.02, 1.225, 0.47, 0.5, 0.9, 0.0, 0.25, 0.0, 0.0, 0.0)
     ball = reference.ReferenceBall(*(np.full(count, v) for v in values))
     start = -np.tile(np.linspace(0.0, CONTROL_DT, phases, endpoint=False) + 5e-4, strikes)
     sim = make_sim(count, IN_AIR, substeps)

@@ -60,7 +60,7 @@ class FlightModel:
         self.prior, self.config = ServePrior(config), config
         dt = config.robot.control_dt
         params = BallParams.from_config(config.ball)
-        self._ball = BallSim(count, "cpu", params, config.ball.table, dt, 1, config.engine.ball_dt)
+        self._ball = BallSim(count, "cpu", params, config.ball.table, dt, 1, config.engine.ball_dt, config.ball.air)
         self._path = torch.full((count, 2, 12), FAR_AWAY)
         self._path[:, :, 3:] = torch.tensor([1.0, *[0.0] * 8])
         self._everyone = torch.ones(count, dtype=torch.bool)

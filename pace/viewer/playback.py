@@ -109,7 +109,7 @@ class FlightLine:
 
     def __init__(self, config: TaskConfig) -> None:
         params = BallParams.from_config(config.ball)
-        self._ball = BallSim(1, "cpu", params, config.ball.table, FLIGHT_DT, 1, config.engine.ball_dt)
+        self._ball = BallSim(1, "cpu", params, config.ball.table, FLIGHT_DT, 1, config.engine.ball_dt, config.ball.air)
         self._far = torch.zeros(1, 2, 12)
         self._far[..., 2] = 100.0  # m: a paddle out of reach
         self._far[..., 3] = 1.0

@@ -37,7 +37,9 @@ STATE = {
     "worlds": "position previous_targets spin velocity",
     "worlds.drawn": "actuator_delay until_push",
     "worlds.drawn.ball": (
-        "drag_coefficient magnus_coefficient mass paddle_friction paddle_restitution table_friction table_restitution"
+        "drag_coefficient magnus_coefficient mass paddle_drilling_loss paddle_friction paddle_restitution "
+        "paddle_tangential_restitution table_drag table_friction table_lift table_restitution "
+        "table_tangential_restitution"
     ),
     "worlds.drawn.engine": "armature_scale effort_scale friction kd_scale kp_scale trunk_com trunk_mass",
     "worlds.engine": "body_contact foot_force joint_torque qpos qpos_path qvel qvel_path warmstart",

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import torch
 
-from pace.config.base import ConfigError, compose, parse
+from pace.config.base import ConfigError, compose, parse, to_dict
 from pace.config.commands import ExportConfig
 from pace.config.training import TrainConfig, load_train_config
 from pace.deploy import export
@@ -332,11 +332,12 @@ def test_the_example_has_the_motors_of_the_training(exported: tuple[Path, dict[s
     np.testing.assert_allclose(model.actuator_biasprm[:, 2], np.negative(meta["kd"]))
 
 
-def test_the_example_flies_the_same_ball(example: Any) -> None:
-    preset = ball_preset("venue")  # with lift
+@pytest.mark.parametrize("name", ["venue", "rubber"])  # constant lift; measured air, rubber that springs back
+def test_the_example_flies_the_same_ball(example: Any, name: str) -> None:
+    preset = ball_preset(name)
     sim = BallSim(1, "cpu", BallParams.from_config(preset), preset.table, 0.002, 1, 0.002)
     velocity, spin = np.array([-5.8, -0.2, 1.7]), np.array([20.0, 60.0, -30.0])
-    ahead, ball = (example.Ball({**vars(preset), "table": vars(preset.table)}) for _ in range(2))
+    ahead, ball = (example.Ball(to_dict(preset)) for _ in range(2))
     for each in (ahead, ball):
         each.serve(example.SERVE_START, velocity)
         each.spin = spin
@@ -353,7 +354,7 @@ def test_the_example_flies_the_same_ball(example: Any) -> None:
         surfaces += [contact.surface for a, b in pairwise(blades) for contact in ball.step(0.001, a, b)]
         assert np.abs(ball.position - sim.position[0].numpy()).max() < 0.004, (step, surfaces)
     assert surfaces == ["own", "paddle"]
-    assert ball.velocity[0] > 2.5
+    assert ball.velocity[0] > 2.0
     assert np.abs(ball.velocity - sim.velocity[0].numpy()).max() < 0.05
     assert np.abs(ball.spin - sim.spin[0].numpy()).max() < 3.0
 

@@ -146,8 +146,8 @@ def test_only_masked_worlds_are_forecast():
 
 
 def test_each_world_has_its_own_parameters():
-    params = BallParams.preset("rubber")
-    drag = torch.tensor([0.4, 0.5, 0.6])
+    params = BallParams.preset("venue")
+    drag = torch.tensor([0.46, params.drag_coefficient, 0.68])
     varied = BallParams(**(vars(params) | {"drag_coefficient": drag}))
     position, velocity = rows([1.35, 0.0, 1.03]).repeat(3, 1), rows([-5.8, 0.0, 1.7]).repeat(3, 1)
     together = forecast_flight(position, velocity, params=varied)

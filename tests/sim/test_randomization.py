@@ -15,12 +15,17 @@ from pace.config.training import TrainConfig, load_train_config
 from pace.sim.ball.ball import ball_preset
 from pace.sim.randomization import BALL_LIMITS, SAMPLED_BALL_PARAMS
 from pace.sim.worlds import Worlds
+from pace.studies.ball_reference import measured_drag, measured_lift
 from pace.studies.ball_trials import PRESETS
 
 WORLDS = 3
 EVERY = torch.ones(WORLDS, dtype=torch.bool)
 TABLE_SPEEDS = np.linspace(2.0, 3.4, 16)  # m/s along the normal: bounces of serves
 PADDLE_SPEEDS = np.linspace(3.0, 12.0, 16)  # strikes
+SLIPS = np.linspace(0.0, 12.0, 16)  # m/s at the paddle: strikes, with the spin of serves
+FLYING = np.linspace(3.5, 8.0, 10)  # m/s, serves and returns
+MEASURED_DRAG = measured_drag(FLYING, np.zeros(10))
+MEASURED_LIFT = 8 / 3 * measured_lift(FLYING, np.full(10, 30.0))  # C_L over S, at the spin that a bounce gives
 
 
 @lru_cache
@@ -51,8 +56,13 @@ def test_wide_covers_every_preset(preset: str) -> None:
     assert rubber.name == "rubber"
     thickness = ball.air_density / rubber.air_density  # the draws have rubber's air
     assert_covered("mass", ball.mass)
-    assert_covered("drag_coefficient", thickness * ball.drag_coefficient)
-    assert_covered("magnus_coefficient", thickness * ball.magnus_coefficient)
+    assert rubber.drag_coefficient == rubber.magnus_coefficient == 0.0
+    assert_covered("table_drag", thickness * (ball.table_drag + ball.drag_coefficient / MEASURED_DRAG))
+    assert_covered("table_lift", thickness * (ball.table_lift + ball.magnus_coefficient / MEASURED_LIFT))
+    assert_covered("table_tangential_restitution", ball.table_tangential_restitution)
+    assert_covered("paddle_drilling_loss", ball.paddle_drilling_loss)
+    springing = ball.paddle_tangential_restitution - ball.paddle_tangential_restitution_slope * SLIPS
+    assert_covered("paddle_tangential_restitution", springing, -rubber.paddle_tangential_restitution_slope * SLIPS)
     for surface, speeds in (("table", TABLE_SPEEDS), ("paddle", PADDLE_SPEEDS)):
         assert_covered(f"{surface}_friction", getattr(ball, f"{surface}_friction"))
         restitution, slope = (getattr(ball, f"{surface}_restitution{end}") for end in ("", "_slope"))
@@ -116,15 +126,23 @@ def assert_only_world_1_changed(before: Tensor, after: Tensor, least: float) -> 
 
 @pytest.mark.parametrize("name", SAMPLED_BALL_PARAMS)
 def test_a_ball_parameter_changes_its_world_alone(worlds: Worlds, name: str) -> None:
+    grip = 50.0 if "tangential" in name else 0.2  # a contact either grips, and springs back, or slides
+
+    def arrange() -> None:
+        for friction in (worlds.ball.params.table_friction, worlds.ball.params.paddle_friction):
+            torch.as_tensor(friction).fill_(grip)
+
     def change() -> None:
+        arrange()
         value = getattr(worlds.ball.params, name)
         value[1] = 0.8 * value[1] if value[1] > 0 else 0.5
 
-    ball, robot = play(worlds, lambda: None)
+    ball, robot = play(worlds, arrange)
     changed_ball, changed_robot = play(worlds, change)
     assert_only_world_1_changed(ball, changed_ball, 1e-3)
     # what the paddle feels of it: another mass, speed or impulse of the ball; air and table act on it before
-    least = 1e-4 if name.startswith(("mass", "paddle")) else -1.0
+    felt = name.startswith(("mass", "paddle")) and name != "paddle_drilling_loss"  # which leaves no impulse
+    least = 1e-4 if felt else -1.0
     assert_only_world_1_changed(robot, changed_robot, least)
 
 

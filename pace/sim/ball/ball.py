@@ -7,16 +7,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from functools import lru_cache
+from pathlib import Path
 
 import torch
 import warp as wp
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from pace.arrays.launch import Bound, Launch, MaskedLaunch
 from pace.arrays.tensors import allocate
 from pace.config.base import ConfigError, config_dir, parse
-from pace.config.sim import BallConfig, TableConfig
+from pace.config.sim import AirConfig, BallConfig, TableConfig
+from pace.sim.ball.aero import AirTables
+from pace.sim.ball.air_tables import air_tables, air_tensors
 from pace.sim.ball.kernels import FORECAST_HORIZON, fly_step, forecast_flight, skip_flight
 from pace.sim.ball.rebound import Material
 from pace.sim.ball.scene import Scene
@@ -43,17 +46,34 @@ def ball_preset(name: str) -> BallConfig:
     if not path.is_file() or name.startswith("_"):
         names = sorted(p.stem for p in folder.glob("*.yaml") if not p.stem.startswith("_"))
         raise ConfigError(f"no ball preset {name!r}; there are {', '.join(names)}")
-    preset = OmegaConf.to_container(OmegaConf.load(path))
-    assert isinstance(preset, dict)
-    layers = [OmegaConf.load(folder / f"{layer}.yaml") for layer in preset.pop("defaults", [])]
-    return parse(OmegaConf.merge(*layers, preset), BallConfig)  # type: ignore[arg-type]
+    return parse(_with_layers(path), BallConfig)
+
+
+def _measured_air() -> AirConfig:
+    """The tables of the default preset."""
+    air = ball_preset(DEFAULT_PRESET).air
+    assert air is not None  # configs/ball/_air.yaml
+    return air
+
+
+def _with_layers(path: Path) -> DictConfig:
+    """A file of configs/ball/ over the files that its ``defaults`` name."""
+    preset = OmegaConf.load(path)
+    assert isinstance(preset, DictConfig)
+    layers = [_with_layers(path.parent / f"{layer}.yaml") for layer in preset.pop("defaults", [])]
+    merged = OmegaConf.merge(*layers, preset)
+    assert isinstance(merged, DictConfig)
+    return merged
 
 
 @dataclass(frozen=True)
 class BallParams:
     """Ball, air and contacts: each a float, or a tensor (N,) with one value a world.
 
-    Restitution is ``restitution - slope * |v_n|``, never below ``min_restitution``. The ball is a hollow sphere.
+    The ball is a hollow sphere. Restitution is ``restitution - slope * |v_n|``, never below ``min_restitution``;
+    tangential restitution ``tangential_restitution - slope * |u|``, u the slip of the contact point (0: it stops;
+    positive: it is reversed). C_d is ``drag_coefficient`` plus ``table_drag`` times the measured table of ``ball.air``,
+    and lift likewise (:mod:`pace.sim.ball.aero`).
     """
 
     mass: Value  # kg
@@ -68,6 +88,12 @@ class BallParams:
     paddle_restitution_slope: Value  # s / m
     paddle_friction: Value
     min_restitution: Value = 0.0
+    table_drag: Value = 0.0  # share of the measured C_d
+    table_lift: Value = 0.0  # share of the measured C_M
+    table_tangential_restitution: Value = 0.0
+    paddle_tangential_restitution: Value = 0.0
+    paddle_tangential_restitution_slope: Value = 0.0  # s / m
+    paddle_drilling_loss: Value = 0.0  # share of the spin about the paddle's normal that a hit takes
 
     @classmethod
     def from_config(cls, config: BallConfig) -> BallParams:
@@ -111,9 +137,10 @@ def _material(restitution: float, friction: float) -> Material:
     return material
 
 
-def _scene(table: TableConfig, path_dt: float) -> Scene:
-    """Table, net and floor in the kernels' form, without the paddle's path."""
+def _scene(table: TableConfig, path_dt: float, air: AirTables) -> Scene:
+    """Table, net, floor and air in the kernels' form, without the paddle's path."""
     scene = Scene()
+    scene.air = air
     scene.table_centre = wp.vec3(0.0, 0.0, table.height - 0.5 * table.thickness)
     scene.table_half = wp.vec3(0.5 * table.length, 0.5 * table.width, 0.5 * table.thickness)
     scene.net_centre = wp.vec3(0.0, 0.0, table.height + 0.5 * table.net_height)
@@ -147,6 +174,8 @@ class BallSim(BallState):
         control_dt: s, duration of one ``fly``.
         substeps: S, intervals between the knots of a paddle path.
         ball_dt: s, longest sub-step of a flight.
+        air: measured coefficients, of which ``params.table_drag`` and ``params.table_lift`` are shares; ``None``:
+            those of the default preset.
     """
 
     def __init__(
@@ -158,6 +187,7 @@ class BallSim(BallState):
         control_dt: float,
         substeps: int,
         ball_dt: float,
+        air: AirConfig | None = None,
     ) -> None:
         if num_worlds < 1:
             raise ValueError(f"num_worlds must be at least 1, got {num_worlds}")
@@ -171,7 +201,8 @@ class BallSim(BallState):
         self.events = allocate(BallEvents, num_worlds, device)
         self.forecast_result = allocate(Forecast, num_worlds, device)
         self._path_shape = (num_worlds, substeps + 1, PATH_WIDTH)
-        self._scene = _scene(table, control_dt / substeps)
+        self._air = air_tensors(air or _measured_air(), device)
+        self._scene = _scene(table, control_dt / substeps, air_tables(self._air))
         self._flown = {"params": matrix, "scene": self._scene, "ball_dt": ball_dt}  # arguments of every flight
         self._ask = allocate(BallState, num_worlds, device)
         self._ahead: dict[float, MaskedLaunch] = {}  # by intercept_x, from _ask

@@ -59,7 +59,7 @@ def substep_length(gaps: wp.vec4, speed: float, paddle_speed: float, remaining: 
 def settle(flight: Flight, contact: Contact, surfaces: int, body: Body, scene: Scene, world: int):
     """The flight after the impulse of ``contact``, at which ``flight`` has arrived; normal and surface velocity there.
 
-    A lasting contact gives nothing back, and the ball stands on the surface.
+    A lasting contact gives nothing back, along the normal or the surface, and the ball stands on the surface.
     """
     gap, normal = gap_to(contact.surface, flight.position, flight.clock, body.radius, scene, world)
     point = flight.position - body.radius * normal
@@ -71,6 +71,9 @@ def settle(flight: Flight, contact: Contact, surfaces: int, body: Body, scene: S
     if contact.lasting:
         material.restitution = 0.0
         material.lowest = 0.0
+        material.tangential = wp.min(material.tangential, 0.0)  # a ball that goes on rolling does not spring
+        material.tangential_slope = 0.0
+        material.drilling_loss = 0.0  # of an impact, not of each sub-step
         after.position = flight.position - wp.min(gap, 0.0) * normal
         after.located = flight.located
     after_velocity, after_spin = rebound(flight.velocity, flight.spin, normal, velocity, body.radius, material)
@@ -82,9 +85,9 @@ def settle(flight: Flight, contact: Contact, surfaces: int, body: Body, scene: S
 
 
 @wp.func
-def free_arc(flight: Flight, body: Body, duration: float) -> Arc:
+def free_arc(flight: Flight, body: Body, scene: Scene, duration: float) -> Arc:
     """The next ``duration`` s of a flight that meets nothing."""
-    end, end_velocity = fly(flight.position, flight.velocity, flight.spin, body.air, duration)
+    end, end_velocity = fly(flight.position, flight.velocity, flight.spin, body.air, scene.air, duration)
     arc = Arc()
     arc.clock = flight.clock
     arc.duration = duration
@@ -111,7 +114,7 @@ def fly_leg(
     Returns the flight after it, impulse included, and the leg that was flown.
     """
     speed = wp.length(flight.velocity) + GRAVITY * longest
-    arc = free_arc(flight, body, substep_length(flight.gaps, speed, paddle_speed, remaining, longest))
+    arc = free_arc(flight, body, scene, substep_length(flight.gaps, speed, paddle_speed, remaining, longest))
     end_gaps = gaps_to(surfaces, arc.end, arc.clock + arc.duration, body.radius, scene, world)
     contact = first_contact(arc, flight.gaps, end_gaps, speed, paddle_speed, body.radius, scene, world)
     leg = Leg()
@@ -120,7 +123,7 @@ def fly_leg(
         contact.lasting = contact.lasting or flight.located >= MAX_LOCATED
         leg.begins = not contact.lasting
         if leg.begins:
-            arc = free_arc(flight, body, contact.time)
+            arc = free_arc(flight, body, scene, contact.time)
     leg.arc = arc
     after = Flight()
     after.position = arc.end

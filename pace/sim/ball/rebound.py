@@ -1,8 +1,11 @@
 """Shapes that a ball can hit and its rebound from them, as Warp functions.
 
 Shapes give the signed distance of a point and the outward unit normal there, so edges and rims are rounded by the
-ball's radius. The rebound is an impulse with Coulomb friction on a hollow sphere (inertia 2/3 m r^2; Nakashima et al.
-2010): the contact either slides or stops slipping (rolling).
+ball's radius. The rebound is an impulse on a hollow sphere (inertia 2/3 m r^2). Along the normal the approach is
+reversed with the restitution e. Along the surface the slip u of the contact point is reversed with the tangential
+restitution e_t (0: it stops, and the ball rolls; rubber springs back: about 0.8), unless Coulomb friction is not enough
+(sliding): the centre loses the share min(2/5 (1 + e_t), mu (1 + e) |v_n| / |u|) of u, and the spin changes by the same
+impulse. Sources: Nakashima et al. 2010 (rigid surface); Conti et al. 2026, arXiv 2606.28805, table IV (rubber).
 """
 
 import warp as wp
@@ -13,12 +16,19 @@ ROLLING_SHARE = 0.4
 
 @wp.struct
 class Material:
-    """Contact of a ball with one surface. Restitution is ``restitution - slope |v_n|``, never below ``lowest``."""
+    """Contact of a ball with one surface.
+
+    Restitution is ``restitution - slope |v_n|``, never below ``lowest``; tangential restitution is
+    ``tangential - tangential_slope |u|``, never below -1 (no friction at all), u the slip of the contact point.
+    """
 
     restitution: wp.float32
     slope: wp.float32  # s/m
     friction: wp.float32
     lowest: wp.float32
+    tangential: wp.float32
+    tangential_slope: wp.float32  # s/m
+    drilling_loss: wp.float32  # share of the spin about the normal that a contact takes
 
 
 @wp.func
@@ -82,6 +92,9 @@ def rebound(velocity: wp.vec3, spin: wp.vec3, normal: wp.vec3, surface: wp.vec3,
     restitution = wp.max(material.restitution - material.slope * approach, material.lowest)
     push = (1.0 + restitution) * approach
     slip = slip_velocity(relative, spin, normal, radius)
-    share = wp.min(ROLLING_SHARE, material.friction * push / wp.max(wp.length(slip), 1.0e-9))
+    speed = wp.length(slip)
+    springing = wp.max(material.tangential - material.tangential_slope * speed, -1.0)
+    share = wp.min(ROLLING_SHARE * (1.0 + springing), material.friction * push / wp.max(speed, 1.0e-9))
     friction = -share * slip
-    return velocity + push * normal + friction, spin - (1.5 / radius) * wp.cross(normal, friction)
+    drilling = material.drilling_loss * wp.dot(spin, normal) * normal
+    return velocity + push * normal + friction, spin - (1.5 / radius) * wp.cross(normal, friction) - drilling

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from pace.sim.ball.aero import Air, air_factors
+from pace.sim.ball.aero import Air, AirTables, air_factors
 from pace.sim.ball.rebound import Material
 
 NOTHING = wp.constant(-1)
@@ -40,6 +40,7 @@ class Scene:
     paddle_half_thickness: wp.float32
     path: wp.array3d[wp.float32]  # (N, S + 1, 12): centre, unit normal, linear and angular velocity
     path_dt: wp.float32  # s between knots
+    air: AirTables
 
 
 @wp.func
@@ -48,7 +49,8 @@ def read_body(params: wp.array2d[wp.float32], world: int) -> Body:
     body = Body()
     body.mass = params[world, 0]
     body.radius = params[world, 1]
-    body.air = air_factors(params[world, 2], params[world, 3], params[world, 4], body.radius, body.mass)
+    drag, magnus, table_drag, table_lift = params[world, 3], params[world, 4], params[world, 12], params[world, 13]
+    body.air = air_factors(params[world, 2], drag, magnus, table_drag, table_lift, body.radius, body.mass)
     body.table.restitution = params[world, 5]
     body.table.slope = params[world, 6]
     body.table.friction = params[world, 7]
@@ -57,6 +59,10 @@ def read_body(params: wp.array2d[wp.float32], world: int) -> Body:
     body.paddle.friction = params[world, 10]
     body.table.lowest = params[world, 11]
     body.paddle.lowest = params[world, 11]
+    body.table.tangential = params[world, 14]
+    body.paddle.tangential = params[world, 15]
+    body.paddle.tangential_slope = params[world, 16]
+    body.paddle.drilling_loss = params[world, 17]
     return body
 
 

@@ -519,7 +519,10 @@ def test_nearest_distance_to_the_paddle_is_found_within_the_step():
 @pytest.mark.parametrize("name", [f.name for f in fields(BallParams)])
 def test_each_parameter_changes_its_own_world_and_no_other(name: str):
     """A serve that bounces, and is struck by a paddle in its way."""
-    params = BallParams(0.003, 0.02, 1.2, 0.5, 0.5, 0.9, 0.01, 0.2, 0.8, 0.01, 0.1, 0.1)
+    air, rubber = (0.5, 0.5), (0.3, 0.6, 0.01, 0.2)
+    # a contact either grips or slides
+    table, paddle = (50.0 if name.startswith(f"{surface}_tangential") else 0.1 for surface in ("table", "paddle"))
+    params = BallParams(0.003, 0.02, 1.2, 0.3, 0.2, 0.9, 0.01, table, 0.8, 0.01, paddle, 0.1, *air, *rubber)
     change = {"min_restitution": 0.85, "radius": 1.02}.get(name)
 
     def play(changed: bool) -> np.ndarray:
@@ -551,7 +554,7 @@ def test_presets_are_checked_and_the_default_is_that_of_training():
     for name in PRESETS:
         assert ball_preset(name).name == name
     assert load_train_config().ball.name == DEFAULT_PRESET
-    with pytest.raises(ConfigError, match="no ball preset 'leather'; there are paper"):
+    with pytest.raises(ConfigError, match="no ball preset 'leather'; there are anti_spin"):
         BallParams.preset("leather")
 
 

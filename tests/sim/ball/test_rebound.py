@@ -7,6 +7,7 @@ import pytest
 import warp as wp
 
 import pace.sim  # noqa: F401  sets Warp up before the kernels below are defined
+from pace.sim.ball.ball import BallParams
 from pace.sim.ball.rebound import Material, box_distance, disc_distance, rebound, slip_velocity
 from pace.studies import ball_reference as reference
 
@@ -74,9 +75,14 @@ def strike(
     friction: float,
     slope: float = 0.0,
     lowest: float = 0.0,
+    tangential: float = 0.0,
+    tangential_slope: float = 0.0,
+    drilling_loss: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Velocity, spin and slip (N, 3) after the rebound."""
     material = Material()
+    material.tangential, material.tangential_slope = tangential, tangential_slope
+    material.drilling_loss = drilling_loss
     material.restitution, material.slope, material.friction, material.lowest = restitution, slope, friction, lowest
     given = [wp.array(a, dtype=wp.vec3, device="cpu") for a in (velocity, spin, normal, surface)]
     out = [wp.zeros(len(velocity), dtype=wp.vec3, device="cpu") for _ in range(3)]
@@ -198,18 +204,20 @@ def _one(velocity: list[float], spin: list[float]) -> tuple[np.ndarray, np.ndarr
     return np.array([velocity]), np.array([spin]), np.array([[0.0, 0.0, 1.0]]), np.zeros((1, 3))
 
 
+@pytest.mark.parametrize("tangential", [-0.2, 0.0, 0.5, 1.0])
 @pytest.mark.parametrize(("restitution", "friction"), [(1.0, 0.0), (1.0, 0.25), (0.9, 1.0), (0.3, 0.1), (0.0, 0.5)])
-def test_energy_in_the_frame_of_the_surface_never_grows(restitution: float, friction: float):
+def test_energy_in_the_frame_of_the_surface_never_grows(restitution: float, friction: float, tangential: float):
     velocity, spin, normal, surface = random_strikes()
-    after, after_spin, _ = strike(velocity, spin, normal, surface, restitution, friction)
-
-    def energy(velocity: np.ndarray, spin: np.ndarray) -> np.ndarray:
-        return np.sum((velocity - surface) ** 2, axis=1) + 2 / 3 * RADIUS**2 * np.sum(spin**2, axis=1)
-
-    before = energy(velocity, spin)
-    assert np.all(energy(after, after_spin) <= before * (1 + 1e-5))
+    after, after_spin, _ = strike(velocity, spin, normal, surface, restitution, friction, tangential=tangential)
+    before = energy(velocity, spin, surface)
+    assert np.all(energy(after, after_spin, surface) <= before * (1 + 1e-5))
     if restitution == 1.0 and friction == 0.0:
-        np.testing.assert_allclose(energy(after, after_spin), before, rtol=1e-5)
+        np.testing.assert_allclose(energy(after, after_spin, surface), before, rtol=1e-5)
+
+
+def energy(velocity: np.ndarray, spin: np.ndarray, surface: np.ndarray) -> np.ndarray:
+    """Twice the energy per unit of mass (N,), in the frame of the surface."""
+    return np.sum((velocity - surface) ** 2, axis=1) + 2 / 3 * RADIUS**2 * np.sum(spin**2, axis=1)
 
 
 def test_spin_about_the_normal_is_left_alone():
@@ -230,3 +238,108 @@ def test_nothing_happens_to_a_ball_that_leaves():
     after, after_spin, _ = strike(leaving, spin, normal, surface, 0.9, 0.3)
     np.testing.assert_allclose(after, leaving, atol=1e-6)
     np.testing.assert_allclose(after_spin, spin, atol=1e-5)
+
+
+# --- rubber -----------------------------------------------------------------------------------------------------------
+
+GRIPS = 1e3  # friction that never lets the contact slide
+
+
+def test_springing_rebound_agrees_with_the_balance_of_momentum():
+    velocity, spin, normal, surface = random_strikes()
+    after, after_spin, _ = strike(velocity, spin, normal, surface, 0.85, 0.6, tangential=0.8)
+    one = np.ones(len(velocity))
+    expected = reference.rebound(velocity, spin, normal, surface, RADIUS * one, 0.85 * one, 0.6 * one, 0.8 * one)
+    np.testing.assert_allclose(after, expected[0], atol=3e-5)
+    np.testing.assert_allclose(after_spin, expected[1], atol=3e-3)
+
+
+@pytest.mark.parametrize("tangential", [-0.2, 0.0, 0.3, 0.82, 1.0])
+def test_a_contact_that_grips_reverses_its_slip(tangential: float):
+    velocity, spin, normal, surface = random_strikes()
+    before = velocity - surface + np.cross(spin, -RADIUS * normal)
+    before -= np.sum(before * normal, axis=1, keepdims=True) * normal
+    _, _, slip = strike(velocity, spin, normal, surface, 0.85, GRIPS, tangential=tangential)
+    np.testing.assert_allclose(slip, -tangential * before, atol=2e-5)
+
+
+def test_springing_share_by_hand():
+    # u = 5 m/s, e_t = 0.9 - 0.02 * 5 = 0.8: the centre loses 2/5 * 1.8 = 0.72 of 5, the spin gains 1.5 / r * 3.6.
+    after, spin, slip = strike(*_one([5.0, 0, -4.0], [0, 0, 0]), 0.5, GRIPS, tangential=0.9, tangential_slope=0.02)
+    np.testing.assert_allclose(after[0], [1.4, 0.0, 2.0], atol=1e-6)
+    np.testing.assert_allclose(spin[0], [0.0, 270.0, 0.0], atol=1e-3)
+    np.testing.assert_allclose(slip[0], [-4.0, 0.0, 0.0], atol=1e-5)
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.05, 0.3])
+def test_springing_rebound_is_what_a_tangential_spring_comes_to(damping: float):
+    """The contact point hangs on a damped spring for half of its period, integrated: no closed form takes part.
+
+    The slip sees 2/5 of the mass, so the spring's rate is that of an oscillator of 1 ms contact; its damping alone says
+    how much comes back: exp(-pi zeta / sqrt(1 - zeta^2)).
+    """
+    velocity, spin, normal, surface = random_strikes(300)
+    contact_time, steps = 1.0e-3, 20_000
+    rate = np.pi / contact_time / np.sqrt(1.0 - damping**2)
+    stiffness, drag = 0.4 * rate**2, 0.4 * 2.0 * damping * rate  # per unit of the ball's mass
+    v, turning, stretch, dt = velocity.copy(), spin.copy(), np.zeros_like(velocity), contact_time / steps
+    for _ in range(steps):
+        at_contact = v - surface + np.cross(turning, -RADIUS * normal)
+        slip = at_contact - np.sum(at_contact * normal, axis=1, keepdims=True) * normal
+        stretch += dt * slip
+        pull = -dt * (stiffness * stretch + drag * slip)
+        v += pull
+        turning += np.cross(-RADIUS * normal, pull) / (2 / 3 * RADIUS**2)
+    comes_back = np.exp(-np.pi * damping / np.sqrt(1.0 - damping**2))
+    v -= 1.85 * np.sum((velocity - surface) * normal, axis=1, keepdims=True) * normal
+    after, after_spin, _ = strike(velocity, spin, normal, surface, 0.85, GRIPS, tangential=comes_back)
+    np.testing.assert_allclose(after, v, atol=5e-3)
+    np.testing.assert_allclose(after_spin, turning, atol=0.4)
+
+
+@pytest.mark.parametrize("tangential", [0.0, 0.8])
+@pytest.mark.parametrize("drilling_loss", [0.0, 0.195])
+def test_rubber_keeps_angular_momentum_but_for_the_drilling_spin(tangential: float, drilling_loss: float):
+    velocity, spin, normal, surface = random_strikes()
+    given = {"tangential": tangential, "drilling_loss": drilling_loss}
+    after, after_spin, _ = strike(velocity, spin, normal, surface, 0.85, 0.5, **given)
+    change = RADIUS * np.cross(normal, after - velocity) + 2 / 3 * RADIUS**2 * (after_spin - spin)
+    drilling = np.sum(spin * normal, axis=1)
+    expected = -2 / 3 * RADIUS**2 * drilling_loss * drilling[:, None] * normal
+    np.testing.assert_allclose(change, expected, atol=2e-6)
+    np.testing.assert_allclose(np.sum(after_spin * normal, axis=1), (1 - drilling_loss) * drilling, atol=1e-3)
+
+
+@pytest.mark.parametrize("topspin", [50.0, 100.0, 150.0])
+def test_topspin_comes_back_from_a_still_blade_reversed_or_nearly_still(topspin: float):
+    """Measured rubber: e_t = 0.819 - 0.010 u leaves 1 - 3/5 (1 + e_t) of the spin, about -0.08."""
+    ball = BallParams.preset("rubber")
+    given = {
+        "tangential": float(ball.paddle_tangential_restitution),
+        "tangential_slope": float(ball.paddle_tangential_restitution_slope),
+    }
+    _, after, _ = strike(*_one([0, 0, -5.0], [0, topspin, 0]), 0.778, float(ball.paddle_friction), **given)
+    springing = 0.819 - 0.010 * RADIUS * topspin
+    assert after[0, 1] == pytest.approx((1 - 0.6 * (1 + springing)) * topspin, rel=1e-3)
+    assert -0.15 * topspin < after[0, 1] < 0.0
+
+
+def test_rubber_does_not_depend_on_the_frame():
+    velocity, spin, normal, surface = random_strikes()
+    given = {"tangential": 0.819, "tangential_slope": 0.01, "drilling_loss": 0.195}
+    drift = np.array([3.0, -7.0, 2.0])
+    still, still_spin, _ = strike(velocity, spin, normal, surface, 0.85, 1.0, **given)
+    moved, moved_spin, _ = strike(velocity + drift, spin, normal, surface + drift, 0.85, 1.0, **given)
+    np.testing.assert_allclose(moved - drift, still, atol=3e-5)
+    np.testing.assert_allclose(moved_spin, still_spin, atol=3e-3)
+    turn = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])  # a proper rotation
+    v, w, n, s = (a @ turn.T for a in (velocity, spin, normal, surface))
+    turned, turned_spin, _ = strike(v, w, n, s, 0.85, 1.0, **given)
+    np.testing.assert_allclose(turned, still @ turn.T, atol=3e-5)
+    np.testing.assert_allclose(turned_spin, still_spin @ turn.T, atol=3e-3)
+
+
+def test_rubber_takes_at_most_what_friction_gives():
+    # u = 10 m/s, mu = 0.1: friction takes 0.1 * 1.5 * 2 = 0.3 m/s, whatever would spring back.
+    after, _, _ = strike(*_one([10.0, 0, -2.0], [0, 0, 0]), 0.5, 0.1, tangential=0.8)
+    np.testing.assert_allclose(after[0], [9.7, 0.0, 1.0], atol=1e-6)
