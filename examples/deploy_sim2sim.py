@@ -226,7 +226,7 @@ class Ball:
         return {name: (distance - self.radius, normal) for name, (distance, normal) in gaps.items()}
 
     def _rebound(self, surface: str, blade: Blade) -> Contact:
-        """Impulse with Coulomb friction on a hollow sphere: it slides, or its slip is stopped, or reversed by rubber."""
+        """Impulse with Coulomb friction on a hollow sphere: it slides, or its slip is stopped or reversed (rubber)."""
         _, normal = self._gaps(self.position, blade)[surface]
         point = self.position - self.radius * normal
         moving = blade.velocity + _cross(blade.rotation, point - blade.centre) if surface == "paddle" else np.zeros(3)
