@@ -24,6 +24,7 @@ from pace.studies import ball_reference as reference
 from pace.studies.ball_strikes import frame_difference, phase_spread
 from pace.studies.ball_trials import (
     BALL_DT,
+    BALLS,
     PRESETS,
     fitted_drag,
     forecast_errors,
@@ -138,7 +139,7 @@ def draw_flights(axes: Axes, start: tuple[list[float], list[float]], title: str)
     table = ball_preset("paper").table
     axes.plot([-table.length / 2, table.length / 2], [table.height] * 2, color="0.3", lw=3)
     axes.plot([0, 0], [table.height, table.height + table.net_height], color="0.3", lw=1.5)
-    for preset, colour in zip(PRESETS, COLOURS, strict=False):
+    for preset, colour in zip(BALLS, COLOURS, strict=False):
         way = trajectory(preset, *start)
         axes.plot(way[:, 0], way[:, 2], color=colour, lw=1.5, label=preset)
     axes.set(xlabel="x (m)", ylabel="z (m)", title=title, ylim=(0, 1.6), aspect="equal")

@@ -20,7 +20,8 @@ CONTROL_DT = 0.02  # s
 SUBSTEPS = 2
 BALL_DT = load_train_config().engine.ball_dt  # s
 TABLE = ball_preset("paper").table
-PRESETS = ("paper", "standard", "venue", "rubber", "anti_spin", "long_pimples", "short_pimples")
+BALLS = ("paper", "standard", "venue", "rubber")  # their flights differ
+PRESETS = (*BALLS, "anti_spin", "long_pimples", "short_pimples")  # and the coverings of the paddle
 #: m, from the paddle's plane to the centre of a touching ball
 REACH = TABLE.paddle_half_thickness + 0.02
 NO_AIR = BallParams(0.0027, 0.02, 0.0, 0.0, 0.0, 0.9, 0.0, 0.25, 0.8, 0.0, 0.3)
