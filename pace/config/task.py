@@ -22,7 +22,9 @@ class ServeConfig:
     vx: Range  # m/s
     vy: Range  # m/s
     vz: Range  # m/s
-    spin: Range  # rad/s, each axis
+    topspin: Range  # rad/s, about the horizontal axis across the flight; positive: the ball drops
+    sidespin: Range  # rad/s, about the vertical, right-handed about +z
+    corkscrew: Range  # rad/s, right-handed about the launch velocity
     max_duration: float  # s since the serve began
     end_after_hit: float  # s after the paddle hit; 0 switches it off
     end_height: float  # m; a ball below it ends the serve
@@ -31,7 +33,7 @@ class ServeConfig:
     head_start: Range = field(default_factory=lambda: [0.0, 0.0])  # s of its flight that an episode's first serve skips
 
     def __post_init__(self) -> None:
-        for name in ("x", "y", "z", "vx", "vy", "vz", "spin"):
+        for name in ("x", "y", "z", "vx", "vy", "vz", "topspin", "sidespin", "corkscrew"):
             check_range(f"serve.{name}", getattr(self, name))
         check_range("serve.head_start", self.head_start, 0.0)
         require(self.max_duration > 0, "serve.max_duration must be positive")

@@ -21,6 +21,9 @@ FORMAT = 3
 #: Landing target of a saved configuration without one (released configuration).
 LANDING_TARGET = (1.15, 0.0)  # m
 
+#: Keys of the spin about each axis.
+SPINS = ("topspin", "sidespin", "corkscrew")  # rad/s
+
 Saved = dict[str, Any]
 Upgrade = tuple[int, Callable[[Saved], None]]
 
@@ -70,6 +73,24 @@ def store_the_predictors_priors(config: Saved) -> None:
         predictor["priors"] = to_dict(PredictorPriors())
 
 
+def split_the_spin(config: Saved) -> None:
+    """``serve.spin`` was one range for three axes, in the serve and in the stages of the curriculum."""
+    serve = _entry(config, "serve")
+    if "spin" in serve:
+        spin = serve.pop("spin")
+        serve.update({name: list(spin) for name in SPINS})
+    stages = config.get("curriculum")
+    for stage in stages if isinstance(stages, list) else ():
+        if isinstance(stage, dict) and isinstance(stage.get("task"), list):
+            stage["task"] = [new for text in stage["task"] for new in _split_spin(text)]
+
+
+def _split_spin(override: Any) -> list[Any]:
+    """``serve.spin=RANGE`` as an override of each axis; others unchanged."""
+    key, equals, spin = override.partition("=") if isinstance(override, str) else ("", "", "")
+    return [f"serve.{name}={spin}" for name in SPINS] if equals and key.strip() == "serve.spin" else [override]
+
+
 def _entry(config: Any, *keys: str) -> Saved:
     """The dictionary under ``keys``; a new empty one if there is none."""
     for key in keys:
@@ -84,6 +105,7 @@ CONFIG_UPGRADES: list[Upgrade] = [
     (2, name_the_robots_parts),
     (2, move_the_landing_target),
     (2, store_the_predictors_priors),
+    (3, split_the_spin),
 ]
 #: (format that it makes, function of the training state: ``ppo``, ``regression`` and ``processes``, each of them with
 #: ``env`` and ``random``). Tensors are in their places.

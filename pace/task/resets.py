@@ -7,7 +7,7 @@ import warp as wp
 from torch import Tensor
 
 from pace.arrays.draws import Column, UniformSampler, columns_of
-from pace.arrays.launch import Launch
+from pace.arrays.launch import Launch, MaskedLaunch
 from pace.config.sim import RobotConfig
 from pace.config.task import ResetConfig, ServeConfig
 from pace.sim.ball.ball import BallSim
@@ -22,16 +22,59 @@ def turn(yaw: wp.array[wp.float32], qpos: wp.array2d[wp.float32]):
     qpos[world, 6] = wp.sin(0.5 * yaw[world])
 
 
+@wp.func
+def _unit(vector: wp.vec3, otherwise: wp.vec3) -> wp.vec3:
+    """``vector`` with length 1; ``otherwise`` if it has none."""
+    length = wp.length(vector)
+    if length > 0.0:
+        return vector / length
+    return otherwise
+
+
+@wp.kernel
+def spin_of(mask: wp.array[wp.bool], about: wp.array[wp.vec3], velocity: wp.array[wp.vec3], spin: wp.array[wp.vec3]):
+    """Spin (rad/s, world frame) of the masked worlds from that ``about`` three axes: topspin, sidespin, corkscrew.
+
+    Of a ball without horizontal velocity, the flight is taken to be towards the robot.
+    """
+    world = wp.tid()
+    if not mask[world]:
+        return
+    flight = velocity[world]
+    ahead = _unit(wp.vec3(flight[0], flight[1], 0.0), wp.vec3(-1.0, 0.0, 0.0))
+    across = wp.vec3(-ahead[1], ahead[0], 0.0)  # z x ahead
+    turns = about[world]
+    spin[world] = turns[0] * across + wp.vec3(0.0, 0.0, turns[1]) + turns[2] * _unit(flight, ahead)
+
+
+def _spinning(about: Tensor, velocity: Tensor, spin: Tensor) -> MaskedLaunch:
+    """:func:`spin_of` as a function of a mask."""
+    return MaskedLaunch(spin_of, len(about), about.device, about=about, velocity=velocity, spin=spin)
+
+
+def world_spin(about: Tensor, velocity: Tensor) -> Tensor:
+    """Spin (N, 3) rad/s in the world frame from topspin, sidespin and corkscrew (N, 3) of balls at ``velocity``."""
+    spin = torch.zeros_like(about)
+    _spinning(about, velocity, spin)(None)
+    return spin
+
+
 class ServeSampler:
-    """Samples the initial position, velocity and spin of serves."""
+    """Samples the initial position, velocity and spin of serves.
+
+    Attributes: ``about`` (N, 3) rad/s, topspin, sidespin and corkscrew of the last samples.
+    """
 
     def __init__(
         self, config: ServeConfig, num_worlds: int, generator: torch.Generator, device: torch.device | str
     ) -> None:
         launch = torch.zeros(num_worlds, 9, device=device)
         self._launch = launch[:, :3], launch[:, 3:6], launch[:, 6:]
-        ranges = [config.x, config.y, config.z, config.vx, config.vy, config.vz, config.spin, config.spin, config.spin]
-        self._sample = UniformSampler(columns_of(launch, ranges), generator)
+        self.about = torch.zeros(num_worlds, 3, device=device)
+        ranges = [config.x, config.y, config.z, config.vx, config.vy, config.vz]
+        spins = columns_of(self.about, [config.topspin, config.sidespin, config.corkscrew])
+        self._sample = UniformSampler(columns_of(launch[:, :6], ranges) + spins, generator)
+        self._spin = _spinning(self.about, *self._launch[1:])
 
     def sample(self, mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Position m, velocity m/s and spin rad/s, each (N, 3), world frame: new in the worlds of ``mask`` (N,) bool.
@@ -39,6 +82,7 @@ class ServeSampler:
         The tensors are allocated once and updated in place.
         """
         self._sample(mask)
+        self._spin(mask)
         return self._launch
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from pace.task.game import Outcome
-from pace.task.resets import PoseSampler, ServeSampler
+from pace.task.resets import PoseSampler, ServeSampler, world_spin
 from pace.task.state import TaskState
 from tests.helpers.fakes import CPU, config, fake_game, set_events
 from tests.helpers.robot import JOINT_NAMES
@@ -300,6 +300,29 @@ def test_serves_are_drawn_in_range() -> None:
         assert float(value.max()) <= high + 1e-6
         assert float(value.mean()) == pytest.approx(0.5 * (low + high), abs=0.03)
     assert not spin.any()
+
+
+@pytest.mark.parametrize("velocity", [(-6.0, 0.0, 1.7), (-5.0, -0.8, -0.5), (3.0, 4.0, 0.0), (0.0, -2.0, 5.0)])
+def test_spin_is_about_the_axes_of_the_flight(velocity: tuple[float, float, float]) -> None:
+    flight = torch.tensor([velocity]).double()
+    ahead = flight * torch.tensor([1.0, 1.0, 0.0])
+    up, ahead, along = torch.tensor([[0.0, 0.0, 1.0]]).double(), ahead / ahead.norm(), flight / flight.norm()
+    axes = torch.cat((torch.linalg.cross(up, ahead), up, along))
+    about = torch.tensor([[30.0, -7.0, 11.0]])
+    found = world_spin(torch.cat((torch.diag(about[0]), about)), flight.float().repeat(4, 1)).double()
+    torch.testing.assert_close(found[:3], about.double().T * axes, atol=1e-5, rtol=1e-6)
+    torch.testing.assert_close(found[3], (about.double().T * axes).sum(0), atol=1e-5, rtol=1e-6)
+    left = torch.linalg.cross(up, ahead)
+    lift = torch.linalg.cross(found[:3], flight.repeat(3, 1))  # direction of the Magnus force
+    assert float(lift[0, 2]) < 0.0  # topspin bends the flight down,
+    assert float((lift[1] * left).sum()) < 0.0  # sidespin of -7 rad/s to the right,
+    assert float(lift[2].norm()) < 1e-4  # and a corkscrew nowhere
+
+
+def test_topspin_of_a_ball_that_drops_straight_is_that_of_one_towards_the_robot() -> None:
+    about = torch.tensor([[10.0, 0.0, 0.0], [0.0, 0.0, 3.0]])
+    spin = world_spin(about, torch.tensor([[0.0, 0.0, -2.0], [0.0, 0.0, 0.0]]))
+    assert spin.tolist() == [[0.0, -10.0, 0.0], [-3.0, 0.0, 0.0]]
 
 
 def test_poses_are_drawn_in_range_and_within_joint_limits() -> None:
