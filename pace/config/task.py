@@ -31,13 +31,31 @@ class ServeConfig:
     serves_per_episode: int  # 0: episodes do not end
     random_phase: bool  # first episodes begin at a random serve, to desynchronise the resets
     head_start: Range = field(default_factory=lambda: [0.0, 0.0])  # s of its flight that an episode's first serve skips
+    # With more than one attempt, a serve is resampled until it lands first on the robot's half, without the net, and
+    # within these limits (null: none), by its forecast; a serve that fails every attempt is played as it is.
+    attempts: int = 1
+    speed: list[float] | None = None  # m/s, of the launch
+    bounce_x: list[float] | None = None  # m
+    bounce_y: list[float] | None = None  # m
 
     def __post_init__(self) -> None:
         for name in ("x", "y", "z", "vx", "vy", "vz", "topspin", "sidespin", "corkscrew"):
             check_range(f"serve.{name}", getattr(self, name))
         check_range("serve.head_start", self.head_start, 0.0)
+        self._check_attempts()
         require(self.max_duration > 0, "serve.max_duration must be positive")
         require(self.serves_per_episode >= 0, "serve.serves_per_episode must be 0 (no end) or more")
+
+    def limits(self) -> dict[str, Range]:
+        """The ranges that limit which samples are accepted, by name."""
+        named = {"speed": self.speed, "bounce_x": self.bounce_x, "bounce_y": self.bounce_y}
+        return {name: limit for name, limit in named.items() if limit is not None}
+
+    def _check_attempts(self) -> None:
+        require(self.attempts >= 1, f"serve.attempts must be at least 1, got {self.attempts}")
+        for name, limit in self.limits().items():
+            check_range(f"serve.{name}", limit)
+            require(self.attempts > 1, f"serve.{name} needs serve.attempts above 1: it limits what is resampled")
 
 
 @dataclass

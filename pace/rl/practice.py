@@ -50,7 +50,7 @@ class ServePractice:
             config.engine.ball_dt,
         )
         self._randomizer = self._make_randomizer()
-        self.serves = ServeSampler(config.serve, count, self.generator, device)
+        self.serves = ServeSampler(config.serve, self.ball, self.generator)
         self._game = Game(config, self.ball, torch.tensor(STANDING, device=device).repeat(count, 1))
         self._track = BallTrack(config)
         self._path = torch.full((count, 2, 12), FAR_AWAY, device=device)

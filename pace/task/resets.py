@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 import warp as wp
 from torch import Tensor
@@ -11,6 +13,7 @@ from pace.arrays.launch import Launch, MaskedLaunch
 from pace.config.sim import RobotConfig
 from pace.config.task import ResetConfig, ServeConfig
 from pace.sim.ball.ball import BallSim
+from pace.sim.ball.state import BallState, ForecastArrays
 from pace.sim.robot_spec import RobotSpec
 
 
@@ -47,6 +50,40 @@ def spin_of(mask: wp.array[wp.bool], about: wp.array[wp.vec3], velocity: wp.arra
     spin[world] = turns[0] * across + wp.vec3(0.0, 0.0, turns[1]) + turns[2] * _unit(flight, ahead)
 
 
+@wp.struct
+class Limits:
+    """Lowest and highest of each limited quantity of a serve; infinite if it has none."""
+
+    speed: wp.vec2  # m/s
+    bounce_x: wp.vec2  # m
+    bounce_y: wp.vec2  # m
+
+
+def _limits_of(config: ServeConfig) -> Limits:
+    limits, given = Limits(), config.limits()
+    for name in Limits.vars:
+        setattr(limits, name, wp.vec2(*given.get(name, (-math.inf, math.inf))))
+    return limits
+
+
+@wp.func
+def _within(value: float, limit: wp.vec2) -> bool:
+    """NaN is within no limit."""
+    return value >= limit[0] and value <= limit[1]
+
+
+@wp.kernel
+def reject(pending: wp.array[wp.bool], forecast: ForecastArrays, velocity: wp.array[wp.vec3], limits: Limits):
+    """Leave those worlds ``pending`` whose serve does not land well, by its forecast."""
+    world = wp.tid()
+    if not pending[world]:
+        return
+    lands = forecast.landing_own[world] and not forecast.net_touched[world]
+    bounce = forecast.bounce[world]
+    lands = lands and _within(bounce[0], limits.bounce_x) and _within(bounce[1], limits.bounce_y)
+    pending[world] = not (lands and _within(wp.length(velocity[world]), limits.speed))
+
+
 def _spinning(about: Tensor, velocity: Tensor, spin: Tensor) -> MaskedLaunch:
     """:func:`spin_of` as a function of a mask."""
     return MaskedLaunch(spin_of, len(about), about.device, about=about, velocity=velocity, spin=spin)
@@ -62,12 +99,15 @@ def world_spin(about: Tensor, velocity: Tensor) -> Tensor:
 class ServeSampler:
     """Samples the initial position, velocity and spin of serves.
 
+    With ``config.attempts`` above 1, serves that do not land well (:class:`pace.config.task.ServeConfig`) are sampled
+    again, in that many rounds at most; their forecast overwrites that of ``ball`` in the masked worlds. The rounds are
+    the same launches whatever is found, so that a CUDA graph can hold them; a CPU stops when no world is left.
+
     Attributes: ``about`` (N, 3) rad/s, topspin, sidespin and corkscrew of the last samples.
     """
 
-    def __init__(
-        self, config: ServeConfig, num_worlds: int, generator: torch.Generator, device: torch.device | str
-    ) -> None:
+    def __init__(self, config: ServeConfig, ball: BallSim, generator: torch.Generator) -> None:
+        num_worlds, device = ball.num_worlds, ball.device
         launch = torch.zeros(num_worlds, 9, device=device)
         self._launch = launch[:, :3], launch[:, 3:6], launch[:, 6:]
         self.about = torch.zeros(num_worlds, 3, device=device)
@@ -75,15 +115,38 @@ class ServeSampler:
         spins = columns_of(self.about, [config.topspin, config.sidespin, config.corkscrew])
         self._sample = UniformSampler(columns_of(launch[:, :6], ranges) + spins, generator)
         self._spin = _spinning(self.about, *self._launch[1:])
+        self._attempts = config.attempts
+        self._pending = torch.zeros(num_worlds, dtype=torch.bool, device=device)
+        if self._attempts > 1:
+            self._forecast = ball.forecaster(BallState(*self._launch), 0.0)
+            given = {"forecast": ball.forecast_result, "velocity": self._launch[1], "limits": _limits_of(config)}
+            self._reject = Launch(reject, num_worlds, ball.device, pending=self._pending, **given)
 
     def sample(self, mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Position m, velocity m/s and spin rad/s, each (N, 3), world frame: new in the worlds of ``mask`` (N,) bool.
 
         The tensors are allocated once and updated in place.
         """
+        if self._attempts == 1:
+            self._try(mask)
+            return self._launch
+        self._pending.copy_(mask)
+        for _ in range(self._attempts):
+            self._try(self._pending)
+            self._forecast(self._pending)
+            self._reject()
+            if self._pending.device.type == "cpu" and not bool(self._pending.any()):
+                break
+        return self._launch
+
+    @property
+    def accepted(self) -> Tensor:
+        """(N,) bool, the worlds whose last sample landed well; with one attempt nobody looks."""
+        return ~self._pending
+
+    def _try(self, mask: Tensor) -> None:
         self._sample(mask)
         self._spin(mask)
-        return self._launch
 
 
 class HeadStart:

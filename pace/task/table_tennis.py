@@ -59,7 +59,7 @@ class TableTennis:
     def _build(self, predictor: Predictor | None) -> None:
         config, worlds, device = self.config, self.worlds, self.worlds.device
         reward = config.reward
-        self._serves = ServeSampler(config.serve, self.num_worlds, self.generator, device)
+        self._serves = ServeSampler(config.serve, worlds.ball, self.generator)
         late = config.serve.head_start[1] > 0
         self._head_start = HeadStart(config.serve, worlds.ball, self.generator) if late else None
         limits = (worlds.joint_lower, worlds.joint_upper)

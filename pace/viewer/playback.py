@@ -95,9 +95,7 @@ class ShowEnv(TableTennisEnv):
 
     def _build(self, predictor: Predictor | None) -> None:
         super()._build(predictor)
-        self._serves = self.chosen = ChosenServes(
-            self.config.serve, self.num_worlds, self.generator, self.worlds.device
-        )
+        self._serves = self.chosen = ChosenServes(self.config.serve, self.worlds.ball, self.generator)
 
     def end_serve(self) -> None:
         """End the current serve; the next one begins with the next control step."""
