@@ -85,6 +85,21 @@ def split_the_spin(config: Saved) -> None:
             stage["task"] = [new for text in stage["task"] for new in _split_spin(text)]
 
 
+def add_the_pauses(state: Saved) -> None:
+    """Without pauses no world waits, every ball is in view, and the next serve is sampled as the last one ends."""
+    for process in state.get("processes") or ():
+        env = process["env"]
+        over, position = env["game.ends.over"], env["worlds.position"]
+        new = {"worlds.in_view": over.new_ones(over.shape), "game.pause.waiting": over.new_zeros(over.shape)}
+        new |= {
+            "game.pause.left": position.new_zeros(over.shape),
+            "game.pause.carried": position.new_zeros(position.shape),
+        }
+        new |= {"game.pause.kind": env["game.ends.outcome"].new_zeros(over.shape)}
+        new |= {"serves.sampled": position.new_zeros(len(position), 9)}
+        env.update({name: value for name, value in new.items() if name not in env})
+
+
 def _split_spin(override: Any) -> list[Any]:
     """``serve.spin=RANGE`` as an override of each axis; others unchanged."""
     key, equals, spin = override.partition("=") if isinstance(override, str) else ("", "", "")
@@ -109,7 +124,7 @@ CONFIG_UPGRADES: list[Upgrade] = [
 ]
 #: (format that it makes, function of the training state: ``ppo``, ``regression`` and ``processes``, each of them with
 #: ``env`` and ``random``). Tensors are in their places.
-STATE_UPGRADES: list[Upgrade] = []
+STATE_UPGRADES: list[Upgrade] = [(3, add_the_pauses)]
 
 
 def upgrade_config(config: Saved, version: int) -> Saved:

@@ -3,8 +3,8 @@
 The defaults of :class:`pace.config.predictor.PredictorPriors` were measured on :data:`MEASURED_ON`. For other serves,
 the flight model of :mod:`pace.predictor.filter` shifts each mean by its change for the middle of the ranges, and scales
 each standard deviation by the change of its range over the corners of the ranges. For serves with limits, the launches
-that keep them stand for the ranges, and the standard deviation of their flights is added in quadrature. For the measured serves the priors
-equal the defaults, to the last digit.
+that keep them stand for the ranges, and the standard deviation of their flights is added in quadrature. For the
+measured serves the priors equal the defaults, to the last digit.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def _scaled(std: list[float], here: Tensor, there: Tensor) -> list[float]:
 
 
 def _widened(std: list[float], here: Tensor, _: Tensor) -> list[float]:
-    """``std`` and that of ``here`` (M, C), added in quadrature: wide ranges scale what hardly varied before too much."""
+    """``std`` and that of ``here`` (M, C), added in quadrature: a scale would be huge for what hardly varied before."""
     return [math.hypot(a, b) for a, b in zip(std, here.std(0).tolist(), strict=True)]
 
 

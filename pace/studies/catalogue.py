@@ -1,6 +1,6 @@
 """The studies by name: engine parity, step sizes, solver settings, paddle reaction, motors, predictors and their error
-bounds, posture, adaptation to the paddle, on-board estimates, bf16 rounding in the update, the balls of a machine, the learning curves of the
-recipes that were tried, and the rooms of the package.
+bounds, posture, adaptation to the paddle, on-board estimates, bf16 rounding in the update, the balls of a machine, the
+learning curves of the recipes that were tried, and the rooms of the package.
 
 They print the tables of the pages in ``docs/results`` and draw their figures.
 """

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from pace.arrays.draws import Column, UniformSampler, columns_of
 from pace.arrays.launch import Launch, MaskedLaunch
+from pace.arrays.state import Stateful
 from pace.config.sim import RobotConfig
 from pace.config.task import ResetConfig, ServeConfig
 from pace.sim.ball.ball import BallSim
@@ -96,30 +97,33 @@ def world_spin(about: Tensor, velocity: Tensor) -> Tensor:
     return spin
 
 
-class ServeSampler:
+class ServeSampler(Stateful):
     """Samples the initial position, velocity and spin of serves.
 
     With ``config.attempts`` above 1, serves that do not land well (:class:`pace.config.task.ServeConfig`) are sampled
     again, in that many rounds at most; their forecast overwrites that of ``ball`` in the masked worlds. The rounds are
     the same launches whatever is found, so that a CUDA graph can hold them; a CPU stops when no world is left.
 
-    Attributes: ``about`` (N, 3) rad/s, topspin, sidespin and corkscrew of the last samples.
+    Attributes: ``launch`` the last samples, as :meth:`sample` returns them; ``about`` (N, 3) rad/s, their topspin,
+    sidespin and corkscrew.
     """
+
+    STATE = ("sampled",)
 
     def __init__(self, config: ServeConfig, ball: BallSim, generator: torch.Generator) -> None:
         num_worlds, device = ball.num_worlds, ball.device
-        launch = torch.zeros(num_worlds, 9, device=device)
-        self._launch = launch[:, :3], launch[:, 3:6], launch[:, 6:]
+        launch = self.sampled = torch.zeros(num_worlds, 9, device=device)
+        self.launch = launch[:, :3], launch[:, 3:6], launch[:, 6:]
         self.about = torch.zeros(num_worlds, 3, device=device)
         ranges = [config.x, config.y, config.z, config.vx, config.vy, config.vz]
         spins = columns_of(self.about, [config.topspin, config.sidespin, config.corkscrew])
         self._sample = UniformSampler(columns_of(launch[:, :6], ranges) + spins, generator)
-        self._spin = _spinning(self.about, *self._launch[1:])
+        self._spin = _spinning(self.about, *self.launch[1:])
         self._attempts = config.attempts
         self._pending = torch.zeros(num_worlds, dtype=torch.bool, device=device)
         if self._attempts > 1:
-            self._forecast = ball.forecaster(BallState(*self._launch), 0.0)
-            given = {"forecast": ball.forecast_result, "velocity": self._launch[1], "limits": _limits_of(config)}
+            self._forecast = ball.forecaster(BallState(*self.launch), 0.0)
+            given = {"forecast": ball.forecast_result, "velocity": self.launch[1], "limits": _limits_of(config)}
             self._reject = Launch(reject, num_worlds, ball.device, pending=self._pending, **given)
 
     def sample(self, mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -129,7 +133,7 @@ class ServeSampler:
         """
         if self._attempts == 1:
             self._try(mask)
-            return self._launch
+            return self.launch
         self._pending.copy_(mask)
         for _ in range(self._attempts):
             self._try(self._pending)
@@ -137,7 +141,7 @@ class ServeSampler:
             self._reject()
             if self._pending.device.type == "cpu" and not bool(self._pending.any()):
                 break
-        return self._launch
+        return self.launch
 
     @property
     def accepted(self) -> Tensor:
