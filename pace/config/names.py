@@ -9,6 +9,8 @@ from pace.config.renamed import renamed_choice
 
 #: Old key -> new key, for every command.
 RENAMED_KEYS = {"run_dir": "out"}
+#: Old key -> the keys that it became.
+SPLIT_KEYS = {"serve.spin": ("serve.topspin", "serve.sidespin", "serve.corkscrew")}
 
 
 def choices(group: str) -> list[str]:
@@ -29,11 +31,13 @@ def split_override(override: str) -> tuple[str, str]:
 
 
 def check_renamed(overrides: Iterable[str]) -> None:
-    """Errors: :class:`ConfigError`, one line with the new name, for a renamed key or choice."""
+    """Errors: :class:`ConfigError`, one line with the new name, for a key or choice that was renamed or split."""
     for override in overrides:
         key, value = split_override(override)
         if key in RENAMED_KEYS:
             raise ConfigError(f"{key}= is now {RENAMED_KEYS[key]}=")
+        if key in SPLIT_KEYS:
+            raise ConfigError(f"{key}= is now one key an axis: {', '.join(f'{new}=' for new in SPLIT_KEYS[key])}")
         for choice in value.strip("[]").split(","):  # of a sweep (-m), or of several experiments
             new = renamed_choice(key, choice.strip())
             if new != choice.strip():

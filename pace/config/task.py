@@ -22,20 +22,60 @@ class ServeConfig:
     vx: Range  # m/s
     vy: Range  # m/s
     vz: Range  # m/s
-    spin: Range  # rad/s, each axis
+    topspin: Range  # rad/s, about the horizontal axis across the flight; positive: the ball drops
+    sidespin: Range  # rad/s, about the vertical, right-handed about +z
+    corkscrew: Range  # rad/s, right-handed about the launch velocity
     max_duration: float  # s since the serve began
     end_after_hit: float  # s after the paddle hit; 0 switches it off
     end_height: float  # m; a ball below it ends the serve
     serves_per_episode: int  # 0: episodes do not end
     random_phase: bool  # first episodes begin at a random serve, to desynchronise the resets
     head_start: Range = field(default_factory=lambda: [0.0, 0.0])  # s of its flight that an episode's first serve skips
+    # With more than one attempt, a serve is resampled until it lands first on the robot's half, without the net, and
+    # within these limits (null: none), by its forecast; a serve that fails every attempt is played as it is.
+    attempts: int = 1
+    speed: list[float] | None = None  # m/s, of the launch
+    bounce_x: list[float] | None = None  # m
+    bounce_y: list[float] | None = None  # m
+    pause: Range = field(default_factory=lambda: [0.0, 0.0])  # s, from the end of a ball to the next serve
+    first_pause: Range = field(default_factory=lambda: [0.0, 0.0])  # s, before the first serve of an episode
+    # shares of what the ball does in a pause: :class:`pace.task.pauses.PauseBall`
+    pause_ball: dict[str, float] = field(default_factory=lambda: {"lies": 1.0, "carried": 0.0, "hidden": 0.0})
 
     def __post_init__(self) -> None:
-        for name in ("x", "y", "z", "vx", "vy", "vz", "spin"):
+        for name in ("x", "y", "z", "vx", "vy", "vz", "topspin", "sidespin", "corkscrew"):
             check_range(f"serve.{name}", getattr(self, name))
         check_range("serve.head_start", self.head_start, 0.0)
+        self._check_attempts()
+        self._check_pauses()
         require(self.max_duration > 0, "serve.max_duration must be positive")
         require(self.serves_per_episode >= 0, "serve.serves_per_episode must be 0 (no end) or more")
+
+    def limits(self) -> dict[str, Range]:
+        """The ranges that limit which samples are accepted, by name."""
+        named = {"speed": self.speed, "bounce_x": self.bounce_x, "bounce_y": self.bounce_y}
+        return {name: limit for name, limit in named.items() if limit is not None}
+
+    @property
+    def has_pauses(self) -> bool:
+        """Serves may have to wait."""
+        return max(self.pause[1], self.first_pause[1]) > 0
+
+    def _check_pauses(self) -> None:
+        check_range("serve.pause", self.pause, 0.0)
+        check_range("serve.first_pause", self.first_pause, 0.0)
+        given = sorted(self.pause_ball)
+        known = given == ["carried", "hidden", "lies"]
+        require(known, f"serve.pause_ball needs exactly carried, hidden, lies; got {', '.join(given)}")
+        shares = self.pause_ball.values()
+        whole = min(shares) >= 0 and math.isclose(sum(shares), 1.0, abs_tol=1e-6)
+        require(whole, f"serve.pause_ball: the shares must not be negative and must sum to 1, got {self.pause_ball}")
+
+    def _check_attempts(self) -> None:
+        require(self.attempts >= 1, f"serve.attempts must be at least 1, got {self.attempts}")
+        for name, limit in self.limits().items():
+            check_range(f"serve.{name}", limit)
+            require(self.attempts > 1, f"serve.{name} needs serve.attempts above 1: it limits what is resampled")
 
 
 @dataclass

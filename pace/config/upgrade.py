@@ -30,6 +30,9 @@ NEW_BALL_SAMPLES = (
     "paddle_drilling_loss",
 )
 
+#: Keys of the spin about each axis.
+SPINS = ("topspin", "sidespin", "corkscrew")  # rad/s
+
 Saved = dict[str, Any]
 Upgrade = tuple[int, Callable[[Saved], None]]
 
@@ -88,11 +91,44 @@ def name_the_first_reading(config: Saved) -> None:
 
 def add_what_rubber_and_air_sample(state: Saved) -> None:
     """A world's samples of ``ball`` that did not exist: no tangential restitution, constant coefficients of the air."""
-    for process in state["processes"]:
+    for process in state.get("processes") or ():
         env = process["env"]
         rows = env["worlds.drawn.ball.mass"]
         for name in NEW_BALL_SAMPLES:
             env.setdefault(f"worlds.drawn.ball.{name}", rows.new_zeros(rows.shape))
+
+
+def split_the_spin(config: Saved) -> None:
+    """``serve.spin`` was one range for three axes, in the serve and in the stages of the curriculum."""
+    serve = _entry(config, "serve")
+    if "spin" in serve:
+        spin = serve.pop("spin")
+        serve.update({name: list(spin) for name in SPINS})
+    stages = config.get("curriculum")
+    for stage in stages if isinstance(stages, list) else ():
+        if isinstance(stage, dict) and isinstance(stage.get("task"), list):
+            stage["task"] = [new for text in stage["task"] for new in _split_spin(text)]
+
+
+def add_the_pauses(state: Saved) -> None:
+    """Without pauses no world waits, every ball is in view, and the next serve is sampled as the last one ends."""
+    for process in state.get("processes") or ():
+        env = process["env"]
+        over, position = env["game.ends.over"], env["worlds.position"]
+        new = {"worlds.in_view": over.new_ones(over.shape), "game.pause.waiting": over.new_zeros(over.shape)}
+        new |= {
+            "game.pause.left": position.new_zeros(over.shape),
+            "game.pause.carried": position.new_zeros(position.shape),
+        }
+        new |= {"game.pause.kind": env["game.ends.outcome"].new_zeros(over.shape)}
+        new |= {"serves.sampled": position.new_zeros(len(position), 9)}
+        env.update({name: value for name, value in new.items() if name not in env})
+
+
+def _split_spin(override: Any) -> list[Any]:
+    """``serve.spin=RANGE`` as an override of each axis; others unchanged."""
+    key, equals, spin = override.partition("=") if isinstance(override, str) else ("", "", "")
+    return [f"serve.{name}={spin}" for name in SPINS] if equals and key.strip() == "serve.spin" else [override]
 
 
 def _entry(config: Any, *keys: str) -> Saved:
@@ -110,10 +146,11 @@ CONFIG_UPGRADES: list[Upgrade] = [
     (2, move_the_landing_target),
     (2, store_the_predictors_priors),
     (3, name_the_first_reading),
+    (3, split_the_spin),
 ]
 #: (format that it makes, function of the training state: ``ppo``, ``regression`` and ``processes``, each of them with
 #: ``env`` and ``random``). Tensors are in their places.
-STATE_UPGRADES: list[Upgrade] = [(3, add_what_rubber_and_air_sample)]
+STATE_UPGRADES: list[Upgrade] = [(3, add_what_rubber_and_air_sample), (3, add_the_pauses)]
 
 
 def upgrade_config(config: Saved, version: int) -> Saved:

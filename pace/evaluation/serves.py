@@ -2,7 +2,8 @@
 
 Each of N worlds plays without episode ends and contributes the same number of serves, whatever their outcome: a stop at
 a total would favour serves that end early, which are the lost ones. The first two serves of a world are not counted
-(the paper's rule). Serves after a fall are counted, because the policy caused the fall.
+(the paper's rule). Serves after a fall are counted, because the policy caused the fall. A fall in a pause is charged to
+the serve before it, whose outcome stays; a fall before a world's first serve is charged to none.
 """
 
 from __future__ import annotations
@@ -65,8 +66,9 @@ class ServeRecorder:
     Call :meth:`begin` after the worlds' reset, :meth:`observe` after each ``advance`` and before the reset of fallen
     worlds, :meth:`begin` again after that.
 
-    Attributes: ``records`` (N * quota + 1, columns), world by world, the last row unused; ``counted``,
-    ``played``, ``bad`` (N,); ``path`` (T, W, 3) base x, y (m) and number of the serve, NaN where not filled.
+    Attributes: ``records`` (N * quota + 1, columns), world by world, the last row unused; ``counted``, ``played``,
+    ``bad`` (N,); ``finished`` (N,) bool, all its serves are counted and the pause after the last one is over; ``path``
+    (T, W, 3) base x, y (m) and number of the serve, NaN where not filled.
     """
 
     def __init__(self, env: TableTennisEnv, warmup_serves: int, quota: int) -> None:
@@ -77,6 +79,8 @@ class ServeRecorder:
         self.path = torch.full((PATH_STEPS, min(n, PATH_WORLDS), 3), torch.nan, device=device)
         self._current = torch.full((n, len(COLUMNS)), torch.nan, device=device)
         self._first_row = torch.arange(n, device=device) * quota
+        self._last_row = torch.full_like(self._first_row, n * quota)
+        self.finished = torch.zeros(n, dtype=torch.bool, device=device)
         self._started = torch.ones(n, dtype=torch.bool, device=device)
         self._edges = torch.tensor(TIME_BINS, device=device)
         self._squares = torch.zeros(2, len(BIN_NAMES), device=device)
@@ -137,15 +141,21 @@ class ServeRecorder:
         env = self.env
         self._current[:, C["outcome"]] = env.serve_outcome.float()
         self._current[:, C["fall"]] = env.terminated.float()
+        in_pause = env.terminated & ~over
+        charged = torch.where(in_pause, self._last_row, self.records.shape[0] - 1)
+        self.records[:, C["fall"]].index_fill_(0, charged, 1.0)
         bad = env.serve_outcome == Outcome.BAD_SERVE
         due = over & self.counting
         kept = due & ~bad
         rows = torch.where(kept, self._first_row + self.counted, self.records.shape[0] - 1)
         self.records.index_copy_(0, rows, self._current)
+        self._last_row.copy_(torch.where(over, rows, self._last_row))
         self.counted += kept
         self.bad += due & bad
         self.played += over
-        self._started.copy_(over)
+        self._started.copy_(env.game.ends.next_serve | env.terminated)
+        pausing = env.game.pause.waiting & ~env.terminated
+        self.finished |= (self.counted == self.quota) & ~pausing
 
     def predictor_errors(self) -> tuple[float, dict[str, float]]:
         """RMSE of the predicted apex (3-D, cm): over all, and by time to the apex; NaN without a predictor."""
@@ -179,7 +189,9 @@ def play(env: TableTennisEnv, policy: TaskPolicy, recorder: ServeRecorder, on_co
     ``RuntimeWarning`` if the contacts exceeded the engine's memory.
     """
     total = env.num_worlds * recorder.quota
-    longest = math.ceil(env.config.serve.max_duration / env.worlds.control_dt) + 1
+    serve = env.config.serve
+    longest = serve.max_duration + max(serve.pause[1], serve.first_pause[1])
+    longest = math.ceil(longest / env.worlds.control_dt) + 1
     recorder.begin()
     for step in range(1, PATIENCE * longest * recorder.serves_per_world + 1):
         env.advance(policy(env.policy_observation))
@@ -187,10 +199,10 @@ def play(env: TableTennisEnv, policy: TaskPolicy, recorder: ServeRecorder, on_co
         env.reset_worlds(env.terminated)
         recorder.begin()
         if step % STEPS_PER_LOOK == 0:
-            counted = int(recorder.counted.sum())
+            counted, finished = torch.stack((recorder.counted.sum(), recorder.finished.sum())).tolist()
             if on_count is not None:
                 on_count(counted)
-            if counted == total:
+            if finished == env.num_worlds:
                 break
     else:
         raise EvaluationError(f"only {counted} of {total} serves were playable: the others miss the robot's half")

@@ -2,13 +2,15 @@
 
 The defaults of :class:`pace.config.predictor.PredictorPriors` were measured on :data:`MEASURED_ON`. For other serves,
 the flight model of :mod:`pace.predictor.filter` shifts each mean by its change for the middle of the ranges, and scales
-each standard deviation by the change of its range over the corners of the ranges. For the measured serves the priors
-equal the defaults, to the last digit.
+each standard deviation by the change of its range over the corners of the ranges. For serves with limits, the launches
+that keep them stand for the ranges, and the standard deviation of their flights is added in quadrature. For the
+measured serves the priors equal the defaults, to the last digit.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass, field, replace
 from itertools import product
 
 import torch
@@ -20,6 +22,7 @@ from pace.config.task import TaskConfig
 from pace.predictor.filter import Parabola, rebound, time_to_table
 
 NO_WIDTH = 1e-6  # smaller widths are rounding errors
+GRID = 5  # values of each quantity
 LEAST_SHARE = 0.5  # of a measured standard deviation: balls, tables and noise differ even for the same serve
 
 
@@ -31,13 +34,14 @@ class Launches:
     velocity: tuple[Range, Range, Range]
     control_dt: float
     target_x: float
+    limits: dict[str, Range] = field(default_factory=dict)  # of the serves that are accepted
 
     @classmethod
     def of(cls, config: TaskConfig) -> Launches:
         """Those of a task."""
         serve = config.serve
         position, velocity = (serve.x, serve.y, serve.z), (serve.vx, serve.vy, serve.vz)
-        return cls(position, velocity, config.robot.control_dt, config.reward.target_x)
+        return cls(position, velocity, config.robot.control_dt, config.reward.target_x, serve.limits())
 
 
 #: The released training serves (configs/serve/train.yaml when the priors were measured), and reward.target_x.
@@ -55,18 +59,29 @@ def resolve_priors(config: TaskConfig, learned: PredictorPriors | None = None) -
 def derive_priors(launches: Launches) -> PredictorPriors:
     """Priors for these serves."""
     measured = PredictorPriors()
-    middle, corners = _middle_and_corners(launches)
+    middle, corners = _accepted(launches) if launches.limits else _middle_and_corners(launches)
     here, there = _flights(middle, launches), _flights(_middle_and_corners(MEASURED_ON)[0], MEASURED_ON)
     reach = _flights(corners, launches), _flights(_middle_and_corners(MEASURED_ON)[1], MEASURED_ON)
     found: dict[str, Prior] = {}
     for name in here:
         prior: Prior = getattr(measured, name)
         moved = (here[name] - there[name])[0].tolist()
-        wide, known = ((flights[name].amax(0) - flights[name].amin(0)).tolist() for flights in reach)
-        shares = [max(a / b, LEAST_SHARE) if b > NO_WIDTH else 1.0 for a, b in zip(wide, known, strict=True)]
         mean = [a + b for a, b in zip(prior.mean, moved, strict=True)]
-        found[name] = Prior(mean, [a * b for a, b in zip(prior.std, shares, strict=True)])
+        widen = _widened if launches.limits else _scaled
+        found[name] = Prior(mean, widen(prior.std, *(flights[name] for flights in reach)))
     return replace(measured, **found)
+
+
+def _scaled(std: list[float], here: Tensor, there: Tensor) -> list[float]:
+    """``std`` times the change of the range, from that of ``there`` (M, C) to that of ``here`` (M', C)."""
+    wide, known = ((flights.amax(0) - flights.amin(0)).tolist() for flights in (here, there))
+    shares = [max(a / b, LEAST_SHARE) if b > NO_WIDTH else 1.0 for a, b in zip(wide, known, strict=True)]
+    return [a * b for a, b in zip(std, shares, strict=True)]
+
+
+def _widened(std: list[float], here: Tensor, _: Tensor) -> list[float]:
+    """``std`` and that of ``here`` (M, C), added in quadrature: a scale would be huge for what hardly varied before."""
+    return [math.hypot(a, b) for a, b in zip(std, here.std(0).tolist(), strict=True)]
 
 
 def _middle_and_corners(launches: Launches) -> tuple[Tensor, Tensor]:
@@ -74,6 +89,24 @@ def _middle_and_corners(launches: Launches) -> tuple[Tensor, Tensor]:
     ranges = (*launches.position, *launches.velocity)
     middle = torch.tensor([[0.5 * (low + high) for low, high in ranges]], dtype=torch.float64)
     return middle, torch.tensor(list(product(*ranges)), dtype=torch.float64)
+
+
+def _accepted(launches: Launches) -> tuple[Tensor, Tensor]:
+    """Mean (1, 6) and all (M, 6) of a grid of launches in the ranges whose flights keep the limits.
+
+    The middle and the corners of the ranges do not stand for serves of which most are resampled. If the flight model
+    accepts none, it is those after all.
+    """
+    ranges = (*launches.position, *launches.velocity)
+    axes = [torch.linspace(low, high, GRID if high > low else 1, dtype=torch.float64) for low, high in ranges]
+    grid = torch.cartesian_prod(*axes)
+    bounce = _flights(grid, launches)["bounce"]
+    limited = {"speed": grid[:, 3:].norm(dim=1), "bounce_x": bounce[:, 0], "bounce_y": bounce[:, 1]}
+    kept = torch.ones(len(grid), dtype=torch.bool)
+    for name, (low, high) in launches.limits.items():
+        kept &= (limited[name] >= low) & (limited[name] <= high)
+    found = grid[kept]
+    return (found.mean(0, keepdim=True), found) if len(found) else _middle_and_corners(launches)
 
 
 def _flights(launch: Tensor, launches: Launches) -> dict[str, Tensor]:

@@ -32,7 +32,8 @@ class ServePractice:
     Attributes, overwritten by :meth:`advance`: ``predictor_input`` (N, 3 frames) m, ``predictor_target`` (N, out),
     ``predictor_valid`` (N,) bool, ``predictor_time_to_apex`` (N,) s, as those of :class:`pace.rl.TableTennisEnv`;
     ``serve_over`` (N,) bool, the serve ended in this step and the next has begun. Besides: ``ball``
-    (:class:`pace.sim.ball.BallSim`) and ``sensing`` (:class:`pace.sim.sensing.Sensing`).
+    (:class:`pace.sim.ball.BallSim`), ``sensing`` (:class:`pace.sim.sensing.Sensing`) and ``serves``
+    (:class:`pace.task.resets.ServeSampler`).
     """
 
     def __init__(self, config: TrainConfig, device: torch.device) -> None:
@@ -50,7 +51,7 @@ class ServePractice:
             config.ball.air,
         )
         self._randomizer = self._make_randomizer()
-        self._serves = ServeSampler(config.serve, count, self.generator, device)
+        self.serves = ServeSampler(config.serve, self.ball, self.generator)
         self._game = Game(config, self.ball, torch.tensor(STANDING, device=device).repeat(count, 1))
         self._track = BallTrack(config)
         self._path = torch.full((count, 2, 12), FAR_AWAY, device=device)
@@ -92,7 +93,7 @@ class ServePractice:
     def _serve(self, mask: Tensor) -> None:
         ball, wide = self.ball, mask.unsqueeze(-1)
         self._randomizer.sample(mask)
-        launch = self._serves.sample(mask)
+        launch = self.serves.sample(mask)
         for value, start in zip((ball.position, ball.velocity, ball.spin), launch, strict=True):
             value.copy_(torch.where(wide, start, value))
         ball.forecast(mask, ball.position, ball.velocity, ball.spin, self.config.reward.target_x)

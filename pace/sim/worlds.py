@@ -267,7 +267,7 @@ class Worlds(Stateful):
         return self._own_tensors() | sampled | with_prefix("engine", self.engine.state_tensors())
 
     def _own_tensors(self) -> dict[str, Tensor]:
-        ball = tensors_named(self.ball, ("position", "velocity", "spin"))
+        ball = tensors_named(self.ball, ("position", "velocity", "spin", "in_view"))
         events = with_prefix("event", named_tensors(self.ball.events))
         return ball | events | {"previous_targets": self._previous_targets}
 

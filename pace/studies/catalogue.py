@@ -1,6 +1,6 @@
 """The studies by name: engine parity, step sizes, solver settings, paddle reaction, motors, predictors and their error
-bounds, posture, adaptation to the paddle, on-board estimates, bf16 rounding in the update, the learning curves of the
-recipes that were tried, and the rooms of the package.
+bounds, posture, adaptation to the paddle, on-board estimates, bf16 rounding in the update, the balls of a machine, the
+learning curves of the recipes that were tried, and the rooms of the package.
 
 They print the tables of the pages in ``docs/results`` and draw their figures.
 """
@@ -28,6 +28,7 @@ from pace.studies import (
     recipe,
     rounding,
     senses,
+    serves,
     steps,
 )
 from pace.studies.common import save_figure
@@ -104,6 +105,13 @@ def study_rounding(options: Options) -> None:
     print(rounding.table(rounding.measure(options.run or GENERALIST, options.worlds)))
 
 
+def study_serves(options: Options) -> None:
+    found = serves.sample()
+    print(f"{found.bad:.1e} of {serves.COUNT:,} balls are bad after all attempts")
+    print(serves.table(found))
+    save_figure(options.out / "serve_machine.png", (13, 3.2), lambda figure: serves.draw(found, figure))
+
+
 def _policies(options: Options) -> list[Path]:
     kept = sorted(path.parent for path in Path("pretrained").glob("*/checkpoint.json"))
     return [options.run] if options.run else kept
@@ -150,6 +158,7 @@ STUDIES = {
     "adaptation": study_adaptation,
     "senses": study_senses,
     "rounding": study_rounding,
+    "serves": study_serves,
     "recipe": study_recipe,
     "learning": study_learning,
     "architecture": study_architecture,

@@ -11,23 +11,25 @@ from pace.config.training import TrainConfig
 from pace.rl.practice import ServePractice
 from pace.sim.ball.ball import BallParams, BallSim
 from pace.sim.randomization import BALL_LIMITS, SAMPLED_BALL_PARAMS
+from pace.task.resets import world_spin
 
 AXES = ("x", "y", "z")
+SPINS = ("topspin", "sidespin", "corkscrew")
 FAR_AWAY = 100.0  # m, position of the paddle
 
 
 class ServePrior:
     """The uniform distributions of a serve, its ball and its sensors, without those of zero width.
 
-    ``names`` (D): position, velocity and spin of the launch by axis (m, m/s, rad/s), ball parameters by name, and
-    ``delay`` in control steps. ``low``, ``width`` (D,).
+    ``names`` (D): position and velocity of the launch by axis (m, m/s), its topspin, sidespin and corkscrew (rad/s),
+    ball parameters by name, and ``delay`` in control steps. ``low``, ``width`` (D,).
     """
 
     def __init__(self, config: TrainConfig) -> None:
         serve, randomization, ball = config.serve, config.randomization, config.ball
         ranges = {f"position_{axis}": getattr(serve, axis) for axis in AXES}
         ranges |= {f"velocity_{axis}": getattr(serve, f"v{axis}") for axis in AXES}
-        ranges |= {f"spin_{axis}": serve.spin for axis in AXES}
+        ranges |= {name: getattr(serve, name) for name in SPINS}
         for name, (range_name, scales) in SAMPLED_BALL_PARAMS.items():
             nominal, (low, high) = float(getattr(ball, name)), getattr(randomization, range_name)
             ranges[name] = [nominal * low, nominal * high] if scales else [nominal + low, nominal + high]
@@ -83,8 +85,9 @@ class FlightModel:
 
     def _launch(self, cube: Tensor) -> dict[str, Tensor]:
         values, ball = self.prior.values(cube), self._ball
-        for name, start in (("position", ball.position), ("velocity", ball.velocity), ("spin", ball.spin)):
+        for name, start in (("position", ball.position), ("velocity", ball.velocity)):
             start.copy_(torch.stack([values[f"{name}_{axis}"] for axis in AXES], dim=1))
+        ball.spin.copy_(world_spin(torch.stack([values[name] for name in SPINS], dim=1), ball.velocity))
         for name in SAMPLED_BALL_PARAMS:
             if name in values:
                 getattr(ball.params, name).copy_(values[name])
@@ -138,7 +141,8 @@ def record(config: TrainConfig, frames: int, predictor: nn.Module | None = None)
 def _drawn(practice: ServePractice) -> dict[str, Tensor]:
     """The samples of the serves that have just begun, by the names of :class:`ServePrior`."""
     ball = practice.ball
-    launch = {"position": ball.position, "velocity": ball.velocity, "spin": ball.spin}
+    launch = {"position": ball.position, "velocity": ball.velocity}
     sampled = {f"{name}_{axis}": value[:, i].clone() for name, value in launch.items() for i, axis in enumerate(AXES)}
+    sampled |= {name: practice.serves.about[:, i].clone() for i, name in enumerate(SPINS)}
     sampled |= {name: getattr(ball.params, name).clone() for name in SAMPLED_BALL_PARAMS}
     return sampled | {"delay": practice.sensing.delay.clone()}

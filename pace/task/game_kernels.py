@@ -78,19 +78,24 @@ def close(
     base_position: wp.array[wp.vec3],
     rules: Rules,
 ):
-    """After :func:`judge`: clock, forecast of a hit, approach of the paddle, ends of serves and episodes."""
+    """After :func:`judge`: clock, forecast of a hit, approach of the paddle, ends of serves and episodes.
+
+    In a pause no serve is on: none ends, and its clock rests.
+    """
     world = wp.tid()
-    game.clock.time[world] += rules.control_dt
+    waiting = game.pause.waiting[world]
+    if not waiting:
+        game.clock.time[world] += rules.control_dt
     if game.referee.hit_now[world]:
         _take_return(game, forecast, world)
     _approach(game, world, paddle_distance[world] - radius[world])
     lost = _lost(base_position[world], rules)
-    over = _over(game, rules, world, ball.position[world][2], events.floor[world] > 0)
+    over = not waiting and _over(game, rules, world, ball.position[world][2], events.floor[world] > 0)
     outcome = _decide(game, world, lost, over)
     game.referee.outcome[world] = outcome
     game.referee.success_now[world] = game.referee.was_open[world] and outcome == Outcome.SUCCESS
     game.ends.lost[world] = lost
-    game.ends.over[world] = over or lost
+    game.ends.over[world] = over or (lost and not waiting)
     game.ends.next_serve[world] = over and not lost
     last = rules.serves_per_episode > 0 and game.clock.index[world] + 1.0 >= float(rules.serves_per_episode)
     game.ends.truncated[world] = over and last and not lost

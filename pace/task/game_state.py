@@ -75,12 +75,22 @@ class Closeness:
 
 
 @dataclass(eq=False)
+class Pause:
+    """Between the end of a ball and the next serve (:mod:`pace.task.pauses`)."""
+
+    waiting: Bool  # a pause is on
+    left: Float  # s until the next serve
+    kind: Int  # what becomes of the ball, :class:`pace.task.pauses.PauseBall`
+    carried: Vec3  # m, where a carried ball is
+
+
+@dataclass(eq=False)
 class StepEnds:
     """Serves and episodes that ended in the last control step."""
 
     lost: Bool  # the robot fell or left its area
     over: Bool  # the serve ended
-    next_serve: Bool  # and another one follows
+    next_serve: Bool  # another one begins: at once, or after a pause
     truncated: Bool  # it was the episode's last
     hit: Bool  # of the current serve, also after the next one has begun
     outcome: Int  # the same
@@ -95,6 +105,7 @@ class GameState:
     target: Target
     returns: ReturnForecast
     closeness: Closeness
+    pause: Pause
     ends: StepEnds
 
 

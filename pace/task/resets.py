@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 import warp as wp
 from torch import Tensor
 
 from pace.arrays.draws import Column, UniformSampler, columns_of
-from pace.arrays.launch import Launch
+from pace.arrays.launch import Launch, MaskedLaunch
+from pace.arrays.state import Stateful
 from pace.config.sim import RobotConfig
 from pace.config.task import ResetConfig, ServeConfig
 from pace.sim.ball.ball import BallSim
+from pace.sim.ball.state import BallState, ForecastArrays
 from pace.sim.robot_spec import RobotSpec
 
 
@@ -22,24 +26,131 @@ def turn(yaw: wp.array[wp.float32], qpos: wp.array2d[wp.float32]):
     qpos[world, 6] = wp.sin(0.5 * yaw[world])
 
 
-class ServeSampler:
-    """Samples the initial position, velocity and spin of serves."""
+@wp.func
+def _unit(vector: wp.vec3, otherwise: wp.vec3) -> wp.vec3:
+    """``vector`` with length 1; ``otherwise`` if it has none."""
+    length = wp.length(vector)
+    if length > 0.0:
+        return vector / length
+    return otherwise
 
-    def __init__(
-        self, config: ServeConfig, num_worlds: int, generator: torch.Generator, device: torch.device | str
-    ) -> None:
-        launch = torch.zeros(num_worlds, 9, device=device)
-        self._launch = launch[:, :3], launch[:, 3:6], launch[:, 6:]
-        ranges = [config.x, config.y, config.z, config.vx, config.vy, config.vz, config.spin, config.spin, config.spin]
-        self._sample = UniformSampler(columns_of(launch, ranges), generator)
+
+@wp.kernel
+def spin_of(mask: wp.array[wp.bool], about: wp.array[wp.vec3], velocity: wp.array[wp.vec3], spin: wp.array[wp.vec3]):
+    """Spin (rad/s, world frame) of the masked worlds from that ``about`` three axes: topspin, sidespin, corkscrew.
+
+    Of a ball without horizontal velocity, the flight is taken to be towards the robot.
+    """
+    world = wp.tid()
+    if not mask[world]:
+        return
+    flight = velocity[world]
+    ahead = _unit(wp.vec3(flight[0], flight[1], 0.0), wp.vec3(-1.0, 0.0, 0.0))
+    across = wp.vec3(-ahead[1], ahead[0], 0.0)  # z x ahead
+    turns = about[world]
+    spin[world] = turns[0] * across + wp.vec3(0.0, 0.0, turns[1]) + turns[2] * _unit(flight, ahead)
+
+
+@wp.struct
+class Limits:
+    """Lowest and highest of each limited quantity of a serve; infinite if it has none."""
+
+    speed: wp.vec2  # m/s
+    bounce_x: wp.vec2  # m
+    bounce_y: wp.vec2  # m
+
+
+def _limits_of(config: ServeConfig) -> Limits:
+    limits, given = Limits(), config.limits()
+    for name in Limits.vars:
+        setattr(limits, name, wp.vec2(*given.get(name, (-math.inf, math.inf))))
+    return limits
+
+
+@wp.func
+def _within(value: float, limit: wp.vec2) -> bool:
+    """NaN is within no limit."""
+    return value >= limit[0] and value <= limit[1]
+
+
+@wp.kernel
+def reject(pending: wp.array[wp.bool], forecast: ForecastArrays, velocity: wp.array[wp.vec3], limits: Limits):
+    """Leave those worlds ``pending`` whose serve does not land well, by its forecast."""
+    world = wp.tid()
+    if not pending[world]:
+        return
+    lands = forecast.landing_own[world] and not forecast.net_touched[world]
+    bounce = forecast.bounce[world]
+    lands = lands and _within(bounce[0], limits.bounce_x) and _within(bounce[1], limits.bounce_y)
+    pending[world] = not (lands and _within(wp.length(velocity[world]), limits.speed))
+
+
+def _spinning(about: Tensor, velocity: Tensor, spin: Tensor) -> MaskedLaunch:
+    """:func:`spin_of` as a function of a mask."""
+    return MaskedLaunch(spin_of, len(about), about.device, about=about, velocity=velocity, spin=spin)
+
+
+def world_spin(about: Tensor, velocity: Tensor) -> Tensor:
+    """Spin (N, 3) rad/s in the world frame from topspin, sidespin and corkscrew (N, 3) of balls at ``velocity``."""
+    spin = torch.zeros_like(about)
+    _spinning(about, velocity, spin)(None)
+    return spin
+
+
+class ServeSampler(Stateful):
+    """Samples the initial position, velocity and spin of serves.
+
+    With ``config.attempts`` above 1, serves that do not land well (:class:`pace.config.task.ServeConfig`) are sampled
+    again, in that many rounds at most; their forecast overwrites that of ``ball`` in the masked worlds. The rounds are
+    the same launches whatever is found, so that a CUDA graph can hold them; a CPU stops when no world is left.
+
+    Attributes: ``launch`` the last samples, as :meth:`sample` returns them; ``about`` (N, 3) rad/s, their topspin,
+    sidespin and corkscrew.
+    """
+
+    STATE = ("sampled",)
+
+    def __init__(self, config: ServeConfig, ball: BallSim, generator: torch.Generator) -> None:
+        num_worlds, device = ball.num_worlds, ball.device
+        launch = self.sampled = torch.zeros(num_worlds, 9, device=device)
+        self.launch = launch[:, :3], launch[:, 3:6], launch[:, 6:]
+        self.about = torch.zeros(num_worlds, 3, device=device)
+        ranges = [config.x, config.y, config.z, config.vx, config.vy, config.vz]
+        spins = columns_of(self.about, [config.topspin, config.sidespin, config.corkscrew])
+        self._sample = UniformSampler(columns_of(launch[:, :6], ranges) + spins, generator)
+        self._spin = _spinning(self.about, *self.launch[1:])
+        self._attempts = config.attempts
+        self._pending = torch.zeros(num_worlds, dtype=torch.bool, device=device)
+        if self._attempts > 1:
+            self._forecast = ball.forecaster(BallState(*self.launch), 0.0)
+            given = {"forecast": ball.forecast_result, "velocity": self.launch[1], "limits": _limits_of(config)}
+            self._reject = Launch(reject, num_worlds, ball.device, pending=self._pending, **given)
 
     def sample(self, mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Position m, velocity m/s and spin rad/s, each (N, 3), world frame: new in the worlds of ``mask`` (N,) bool.
 
         The tensors are allocated once and updated in place.
         """
+        if self._attempts == 1:
+            self._try(mask)
+            return self.launch
+        self._pending.copy_(mask)
+        for _ in range(self._attempts):
+            self._try(self._pending)
+            self._forecast(self._pending)
+            self._reject()
+            if self._pending.device.type == "cpu" and not bool(self._pending.any()):
+                break
+        return self.launch
+
+    @property
+    def accepted(self) -> Tensor:
+        """(N,) bool, the worlds whose last sample landed well; with one attempt nobody looks."""
+        return ~self._pending
+
+    def _try(self, mask: Tensor) -> None:
         self._sample(mask)
-        return self._launch
+        self._spin(mask)
 
 
 class HeadStart:

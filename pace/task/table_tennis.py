@@ -19,6 +19,7 @@ from pace.sim.worlds import Worlds
 from pace.task.game import Game
 from pace.task.history import History
 from pace.task.observations import CRITIC, POLICY, layout
+from pace.task.pauses import Pauses
 from pace.task.resets import HeadStart, PoseSampler, ServeSampler
 from pace.task.rewards import RewardManager
 from pace.task.signals import ActorSignals
@@ -59,12 +60,14 @@ class TableTennis:
     def _build(self, predictor: Predictor | None) -> None:
         config, worlds, device = self.config, self.worlds, self.worlds.device
         reward = config.reward
-        self._serves = ServeSampler(config.serve, self.num_worlds, self.generator, device)
+        self._serves = self._make_serves()
         late = config.serve.head_start[1] > 0
         self._head_start = HeadStart(config.serve, worlds.ball, self.generator) if late else None
         limits = (worlds.joint_lower, worlds.joint_upper)
         self._poses = PoseSampler(config.reset, config.robot, self.num_worlds, worlds.nominal, limits, self.generator)
         self.game = Game(config, worlds.ball, worlds.robot.base_position)
+        given = (self.game, worlds.ball, self._serves.launch[0], worlds.control_dt, self.generator)
+        self._pauses = Pauses(config.serve, *given) if config.serve.has_pauses else None
         self.sensing = Sensing(
             config.sensing, self.num_worlds, device, worlds.control_dt, worlds.nominal, self.generator
         )
@@ -76,6 +79,9 @@ class TableTennis:
         self.rewards = RewardManager(reward, self.num_worlds, device, worlds.control_dt)
         paddle = PaddleChain(worlds.model, worlds.spec.paddle)
         self.actor = ActorSignals(config, self.sensing, self.task_state.action, paddle, predictor)
+
+    def _make_serves(self) -> ServeSampler:
+        return ServeSampler(self.config.serve, self.worlds.ball, self.generator)
 
     def _allocate(self) -> None:
         names, count, device = self.config.observation, self.num_worlds, self.worlds.device
@@ -126,10 +132,10 @@ class TableTennis:
         Order: (1) the action becomes joint targets; robot and ball move through the step, with the action's and the
         sensors' delays inside it. (2) The referee consumes the ball's events in the order of their times; balls that
         were hit get a forecast of their flight. (3) Falls and the ends of serves are seen, and serves that end are
-        decided. (4) Rewards, on that state. (5) Where a serve is over and the robot stands, the next serve begins at
-        once; also where the episode is truncated, so that its last observation, from which the value is bootstrapped,
-        is what would have come next. (6) Sensors, predictor, observations. Nothing is reset here: the observations
-        of worlds that are done are their last ones, until :meth:`reset_worlds`.
+        decided. (4) Rewards, on that state. (5) Where a serve is over and the robot stands, the next serve begins, at
+        once or after a pause (``serve.pause``); also where the episode is truncated, so that its last observation, from
+        which the value is bootstrapped, is what would have come next. (6) Sensors, predictor, observations. Nothing is
+        reset here: the observations of worlds that are done are their last ones, until :meth:`reset_worlds`.
         """
         self._step_in_place(action)
 
@@ -141,7 +147,10 @@ class TableTennis:
         next_serve = self.game.ends.next_serve
         self.statistics.add()
         self.game.count_serves()
-        self._start_serves(next_serve)
+        self._serves.sample(next_serve)
+        if self._pauses is not None:
+            self._pauses.step()
+        self._start_serves(next_serve, next_serve)
         self.sensing.update(self.worlds.robot, self.worlds.ball.position, next_serve)
         self.actor.step(next_serve)
         self._compute_truth()
@@ -163,7 +172,9 @@ class TableTennis:
         qpos, qvel = self._poses.sample(mask)
         self.worlds.reset_robot(mask, qpos, qvel)
         self.game.start_episode(mask, self.generator)
-        self._start_serves(mask, self._head_start)
+        self._serves.sample(mask)
+        launched = mask if self._pauses is None else self._pauses.begin(mask)
+        self._start_serves(mask, launched, self._head_start)
         for action in (self.task_state.action, self.task_state.previous_action):
             action.masked_fill_(mask.unsqueeze(-1), 0.0)
         self.sensing.reset(mask, self.worlds.robot, self.worlds.ball.position)
@@ -177,6 +188,8 @@ class TableTennis:
         state.previous_action.copy_(state.action)
         torch.clamp(action, -robot.action_clip, robot.action_clip, out=state.action)
         self.worlds.step(torch.add(self.worlds.nominal, state.action, alpha=robot.action_scale))
+        if self._pauses is not None:
+            self._pauses.carry()
 
     def _judge(self) -> None:
         """Referee, forecast of the returns, ends of serves and episodes."""
@@ -184,10 +197,12 @@ class TableTennis:
         self._forecast_return(self.game.referee.hit_now)
         self.game.close()
 
-    def _start_serves(self, mask: Tensor, head_start: HeadStart | None = None) -> None:
-        self.worlds.serve(mask, *self._serves.sample(mask))
+    def _start_serves(self, mask: Tensor, launched: Tensor, head_start: HeadStart | None = None) -> None:
+        """Launch the sampled serves of ``launched`` (N,) bool. The others of ``mask`` wait: their ball, which is not
+        in play, is a bad serve until then."""
+        self.worlds.serve(launched, *self._serves.launch)
         if head_start is not None:
-            head_start.give(mask)
+            head_start.give(launched)
         self._forecast_serve(mask)
         self.game.start_serve(mask)
 
@@ -237,6 +252,7 @@ class TableTennis:
         return {
             "worlds": self.worlds,
             "game": self.game,
+            "serves": self._serves,
             "state": self.task_state,
             "sensing": self.sensing,
             "policy": self._policy_history,

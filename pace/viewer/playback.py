@@ -16,7 +16,6 @@ from torch import Tensor
 
 from pace.config.overrides import ON_A_CPU, override_task, without_reward
 from pace.config.task import TaskConfig
-from pace.onboard.actor import Predictor
 from pace.rl.policies import TaskPolicy
 from pace.sim.ball.ball import BallParams, BallSim
 from pace.sim.render import Ball, Line, Mark
@@ -93,11 +92,9 @@ class ShowEnv(TableTennisEnv):
 
     chosen: ChosenServes
 
-    def _build(self, predictor: Predictor | None) -> None:
-        super()._build(predictor)
-        self._serves = self.chosen = ChosenServes(
-            self.config.serve, self.num_worlds, self.generator, self.worlds.device
-        )
+    def _make_serves(self) -> ChosenServes:
+        self.chosen = ChosenServes(self.config.serve, self.worlds.ball, self.generator)
+        return self.chosen
 
     def end_serve(self) -> None:
         """End the current serve; the next one begins with the next control step."""

@@ -22,11 +22,13 @@ STATE = {
     "game.clock": "fresh index played time",
     "game.closeness": "arrived arrived_now nearest previous",
     "game.ends": "hit lost next_serve outcome over truncated",
+    "game.pause": "carried kind left waiting",
     "game.referee": "hit hit_now net_touched outcome own_bounces rim success_now touch_time touched was_open",
     "game.returns": "landing lands_opponent lands_own net_height",
     "game.target": "apex apex_time arriving idle_point playable point something_to_hit time",
     "policy": "frame observation",
     "rewards": "_weights reward sums values",
+    "serves": "sampled",
     "sensing": "_amplitude _delay _line _nominal _scale _sensed",
     "state": (
         "action apex arrival base_error feet_distance foot_contact foot_load lost mocap_delay nominal "
@@ -34,7 +36,7 @@ STATE = {
     ),
     "statistics": "sums",
     "track": "positions something_to_hit turned",
-    "worlds": "position previous_targets spin velocity",
+    "worlds": "in_view position previous_targets spin velocity",
     "worlds.drawn": "actuator_delay until_push",
     "worlds.drawn.ball": (
         "drag_coefficient magnus_coefficient mass paddle_drilling_loss paddle_friction paddle_restitution "

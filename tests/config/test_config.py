@@ -71,7 +71,7 @@ def test_default_reward_is_the_paper_reward_with_its_changes() -> None:
         ("+gama=0.9", "gama"),
         ("+algo.gama=0.9", "algo.gama"),
         ("+reward.terms.success.wieght=3", "reward.terms.success.wieght"),
-        ("+serve.speed=[5.0,6.0]", "serve.speed"),
+        ("+serve.velocity=[5.0,6.0]", "serve.velocity"),
     ],
 )
 def test_unknown_key_is_named(override: str, key: str) -> None:

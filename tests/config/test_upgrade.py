@@ -14,7 +14,7 @@ from pace.config.base import ConfigError, parse, to_dict
 from pace.config.overrides import override_task
 from pace.config.renamed import RENAMED_CHOICES
 from pace.config.training import TrainConfig, load_train_config
-from pace.config.upgrade import FORMAT, upgrade_config, upgrade_state
+from pace.config.upgrade import FORMAT, SPINS, upgrade_config, upgrade_state
 from pace.rl.policies import load_policy
 from pace.runs.checkpoint import META, load_checkpoint, read_meta
 from pace.runs.queue import Run, check_settings
@@ -25,6 +25,8 @@ def old_config(**changes: Any) -> dict[str, Any]:
     """The default configuration as commit 43400ac saved it."""
     config = to_dict(load_train_config())
     del config["out"]
+    serve = {name: value for name, value in config["serve"].items() if name not in SPINS}
+    config["serve"] = serve | {"spin": [0.0, 0.0]}
     return config | {"run_dir": "runs/old"} | changes
 
 
@@ -49,6 +51,20 @@ def test_renamed_choices_are_renamed_in_what_was_saved(monkeypatch: pytest.Monke
         override_task(load_train_config(), ["sensing=blurred"])
     with pytest.raises(ConfigError, match="sensing=blurred is now sensing=wide"):
         load_train_config(["sensing=blurred"])
+
+
+def test_one_range_of_spin_is_that_of_each_axis() -> None:
+    old = old_config(curriculum=[{"samples": 1e6, "task": ["serve.spin=[-9.0,9.0]", "sensing=wide"]}])
+    old["serve"]["spin"] = [-5.0, 30.0]
+    new = parse(upgrade_config(old, 1), TrainConfig)
+    assert [getattr(new.serve, name) for name in SPINS] == [[-5.0, 30.0]] * 3
+    assert new.curriculum[0].task == [*(f"serve.{name}=[-9.0,9.0]" for name in SPINS), "sensing=wide"]
+    for odd in ({}, {"serve": 3, "curriculum": [None, {"task": [7]}]}):
+        assert upgrade_config(odd, 2) == odd
+    with pytest.raises(ConfigError, match=r"serve\.topspin=, serve\.sidespin=, serve\.corkscrew="):
+        load_train_config(["serve.spin=[0.0,1.0]"])
+    with pytest.raises(ConfigError, match=r"serve\.spin= is now one key an axis"):
+        override_task(load_train_config(), ["serve.spin=[0.0,1.0]"])
 
 
 def test_upgrades_run_in_order_and_only_where_they_are_due(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -54,18 +54,46 @@ def fake_env(worlds: int) -> SimpleNamespace:
     ball = SimpleNamespace(velocity=torch.tensor([-6.0, 0.1, 1.7]).repeat(n, 1), events=events)
     robot = SimpleNamespace(base_position=torch.tensor([-1.8, 0.3, 0.7]).repeat(n, 1))
     returns = SimpleNamespace(landing=torch.full((n, 3), torch.nan), net_height=torch.full((n,), torch.nan))
+    ends = SimpleNamespace(next_serve=torch.zeros(n, dtype=torch.bool))
+    pause = SimpleNamespace(waiting=torch.zeros(n, dtype=torch.bool))
     referee = SimpleNamespace(hit_now=torch.zeros(n, dtype=torch.bool))
     return SimpleNamespace(
         **flags,
         num_worlds=n,
         config=make_config(),
         worlds=SimpleNamespace(device=torch.device("cpu"), ball=ball, robot=robot),
-        game=SimpleNamespace(referee=referee, returns=returns),
+        game=SimpleNamespace(referee=referee, returns=returns, ends=ends, pause=pause),
         actor=SimpleNamespace(predictor=object(), prediction=torch.zeros(n, 7)),
         serve_outcome=torch.zeros(n, dtype=torch.int32),
         predictor_target=torch.zeros(n, 7),
         predictor_time_to_apex=torch.full((n,), 0.15),
     )
+
+
+def test_a_fall_in_a_pause_is_charged_to_the_serve_before() -> None:
+    env = fake_env(2)
+    recorder = ServeRecorder(env, warmup_serves=0, quota=1)  # type: ignore[arg-type]
+    recorder.begin()
+    env.serve_outcome[:] = int(Outcome.SUCCESS)
+
+    def step(over: bool, waiting: bool, fall: bool) -> None:
+        env.serve_over.fill_(over)
+        env.game.pause.waiting.fill_(waiting)
+        env.terminated[1] = fall
+        recorder.observe()
+        recorder.begin()
+
+    step(over=False, waiting=True, fall=True)  # before the first serve: nobody is charged
+    step(over=True, waiting=True, fall=False)
+    assert recorder.records[:2, C["fall"]].tolist() == [0.0, 0.0]
+    assert not recorder.finished.any()  # a fall may still come
+    step(over=False, waiting=True, fall=True)
+    assert recorder.finished.tolist() == [False, True]
+    step(over=False, waiting=False, fall=False)
+    assert recorder.finished.all()
+    assert recorder.records[:2, C["fall"]].tolist() == [0.0, 1.0]
+    assert recorder.records[:2, C["outcome"]].tolist() == [float(Outcome.SUCCESS)] * 2
+    assert recorder.counted.tolist() == [1, 1]
 
 
 def test_the_recorder_keeps_what_happened_to_each_counted_serve() -> None:
@@ -78,6 +106,7 @@ def test_the_recorder_keeps_what_happened_to_each_counted_serve() -> None:
         env.serve_outcome[:] = torch.tensor([int(code) for code in outcome])
         env.game.referee.hit_now[:] = torch.tensor([hit, False])
         env.terminated[:] = torch.tensor([False, fall])
+        env.game.ends.next_serve[:] = env.serve_over & ~env.terminated
         recorder.observe()
         recorder.begin()
 

@@ -85,6 +85,14 @@ def test_landing_and_net_height_of_a_return():
         assert bool(getattr(forecast, name).isnan().all()), name
 
 
+def test_a_touch_of_the_net_counts_before_the_landing_alone():
+    # Into the net; over it; and, after a bounce in front of it, into it.
+    position = rows([0.5, 0.0, 0.85], [1.35, 0.0, 1.03], [0.6, 0.0, 0.9])
+    forecast = forecast_flight(position, rows([-5.0, 0.0, 0.0], [-5.8, 0.0, 1.75], [-2.0, 0.0, 0.0]), params=VACUUM)
+    assert forecast.net_touched.tolist() == [True, False, False]
+    assert forecast.landing_own.tolist() == [False, True, False]
+
+
 def test_a_ball_that_misses_the_table_lands_on_the_floor():
     forecast = forecast_flight(rows([-1.5, 0.2, 1.0]), rows([7.0, 0.0, 3.5]), params=VACUUM)
     assert float(forecast.landing[0, 2]) == pytest.approx(0.02, abs=1e-5)

@@ -33,6 +33,19 @@ def test_they_move_with_the_serves_and_the_target() -> None:
     assert priors.position == PredictorPriors().position  # of the table
 
 
+def test_for_serves_with_limits_they_are_those_of_the_balls_that_are_accepted() -> None:
+    config = load_train_config(["serve=machine", "num_worlds=1024"])
+    priors, practice = derive_priors(Launches.of(config)), flown(config)
+    for name in ("apex", "launch_velocity", "bounce", "target", "target_time"):
+        prior = getattr(priors, name)
+        assert torch.tensor([*prior.mean, *prior.std]).isfinite().all()
+        assert min(prior.std) > 0
+    apex = practice.predictor_target[practice.predictor_valid][:, :3]
+    torch.testing.assert_close(torch.tensor(priors.apex.mean), apex.mean(0), atol=0.25, rtol=0.0)
+    shares = torch.tensor(priors.apex.std) / apex.std(0)
+    assert 1.0 < float(shares.min()) <= float(shares.max()) < 4.0
+
+
 def flown(config: TrainConfig) -> ServePractice:
     """Serves a third of a second after the launch."""
     practice = ServePractice(config, torch.device("cpu"))

@@ -8,10 +8,13 @@ from typing import Any
 import pytest
 import torch
 
+from pace.config.base import ConfigError
+from pace.config.task import ServeConfig
+from pace.sim.ball.ball import BallParams, BallSim
 from pace.task.game import Outcome
-from pace.task.resets import PoseSampler, ServeSampler
+from pace.task.resets import PoseSampler, ServeSampler, world_spin
 from pace.task.state import TaskState
-from tests.helpers.fakes import CPU, config, fake_game, set_events
+from tests.helpers.fakes import CPU, config, fake_ball, fake_game, set_events
 from tests.helpers.robot import JOINT_NAMES
 
 YES = torch.ones(1, dtype=torch.bool)
@@ -289,7 +292,7 @@ def test_an_early_hit_is_an_arrival() -> None:
 
 def test_serves_are_drawn_in_range() -> None:
     serve, everyone = config().serve, torch.ones(4000, dtype=torch.bool)
-    position, velocity, spin = ServeSampler(serve, 4000, torch.Generator().manual_seed(0), CPU).sample(everyone)
+    position, velocity, spin = ServeSampler(serve, fake_ball(4000), torch.Generator().manual_seed(0)).sample(everyone)
     for value, low_high in zip(
         (*position.unbind(1), *velocity.unbind(1)),
         (serve.x, serve.y, serve.z, serve.vx, serve.vy, serve.vz),
@@ -300,6 +303,67 @@ def test_serves_are_drawn_in_range() -> None:
         assert float(value.max()) <= high + 1e-6
         assert float(value.mean()) == pytest.approx(0.5 * (low + high), abs=0.03)
     assert not spin.any()
+
+
+@pytest.mark.parametrize("velocity", [(-6.0, 0.0, 1.7), (-5.0, -0.8, -0.5), (3.0, 4.0, 0.0), (0.0, -2.0, 5.0)])
+def test_spin_is_about_the_axes_of_the_flight(velocity: tuple[float, float, float]) -> None:
+    flight = torch.tensor([velocity]).double()
+    ahead = flight * torch.tensor([1.0, 1.0, 0.0])
+    up, ahead, along = torch.tensor([[0.0, 0.0, 1.0]]).double(), ahead / ahead.norm(), flight / flight.norm()
+    axes = torch.cat((torch.linalg.cross(up, ahead), up, along))
+    about = torch.tensor([[30.0, -7.0, 11.0]])
+    found = world_spin(torch.cat((torch.diag(about[0]), about)), flight.float().repeat(4, 1)).double()
+    torch.testing.assert_close(found[:3], about.double().T * axes, atol=1e-5, rtol=1e-6)
+    torch.testing.assert_close(found[3], (about.double().T * axes).sum(0), atol=1e-5, rtol=1e-6)
+    left = torch.linalg.cross(up, ahead)
+    lift = torch.linalg.cross(found[:3], flight.repeat(3, 1))  # direction of the Magnus force
+    assert float(lift[0, 2]) < 0.0  # topspin bends the flight down,
+    assert float((lift[1] * left).sum()) < 0.0  # sidespin of -7 rad/s to the right,
+    assert float(lift[2].norm()) < 1e-4  # and a corkscrew nowhere
+
+
+def test_topspin_of_a_ball_that_drops_straight_is_that_of_one_towards_the_robot() -> None:
+    about = torch.tensor([[10.0, 0.0, 0.0], [0.0, 0.0, 3.0]])
+    spin = world_spin(about, torch.tensor([[0.0, 0.0, -2.0], [0.0, 0.0, 0.0]]))
+    assert spin.tolist() == [[0.0, -10.0, 0.0], [-3.0, 0.0, 0.0]]
+
+
+def sampled(count: int, *overrides: str) -> tuple[ServeSampler, BallSim, ServeConfig]:
+    """Serves of ``serve=machine``, sampled once in all of ``count`` worlds."""
+    task = config("serve=machine", *overrides)
+    params, dt = BallParams.from_config(task.ball), task.robot.control_dt
+    ball = BallSim(count, CPU, params, task.ball.table, dt, 1, task.engine.ball_dt)
+    sampler = ServeSampler(task.serve, ball, torch.Generator().manual_seed(0))
+    start = sampler.sample(torch.ones(count, dtype=torch.bool))
+    ball.forecast(torch.ones(count, dtype=torch.bool), *start, -1.6)
+    return sampler, ball, task.serve
+
+
+def test_the_machine_serves_balls_that_land_on_the_robots_half() -> None:
+    sampler, ball, serve = sampled(20000)
+    forecast, velocity = ball.forecast_result, sampler.sample(torch.zeros(20000, dtype=torch.bool))[1]
+    good = forecast.landing_own & ~forecast.net_touched
+    limited = (velocity.norm(dim=1), forecast.bounce[:, 0], forecast.bounce[:, 1])
+    for value, (low, high) in zip(limited, serve.limits().values(), strict=True):
+        good &= (value >= low) & (value <= high)
+    assert float((~good).float().mean()) < 1e-3
+    for column, name in enumerate(("topspin", "sidespin", "corkscrew")):
+        assert sampler.about[:, column].abs().max() <= 60.0
+        assert float(sampler.about[:, column].std()) == pytest.approx(120 / 12**0.5, rel=0.05), name
+
+
+def test_one_more_attempt_resamples_the_bad_serves_alone() -> None:
+    (twice, _, _), (more, _, _) = sampled(2000, "serve.attempts=2"), sampled(2000, "serve.attempts=3")
+    nobody = torch.zeros(2000, dtype=torch.bool)
+    kept = (twice.sample(nobody)[0] == more.sample(nobody)[0]).all(1)
+    assert 0.5 < float(kept.float().mean()) < 0.75  # two rounds accept 1 - 0.6^2
+
+
+def test_limits_need_attempts() -> None:
+    with pytest.raises(ConfigError, match=r"serve\.speed needs serve\.attempts above 1"):
+        config("serve.speed=[4.0,5.0]")
+    with pytest.raises(ConfigError, match=r"serve\.bounce_y: low 0\.5 is above high 0\.2"):
+        config("serve=machine", "serve.bounce_y=[0.5,0.2]")
 
 
 def test_poses_are_drawn_in_range_and_within_joint_limits() -> None:

@@ -161,6 +161,7 @@ class BallSim(BallState):
 
     Attributes:
         position, velocity, spin: (N, 3) m, m/s, rad/s: the ball.
+        in_view: (N,) bool, the sensors can see the ball.
         params: :class:`BallParams` of tensors (N,).
         events: :class:`BallEvents` of the last control step.
         nearest_paddle_distance: (N,) m, smallest distance of ball's and paddle's centre in the last control step.
@@ -195,6 +196,7 @@ class BallSim(BallState):
         self.device = torch.device(device)
         self.control_dt = control_dt
         super().__init__(**vars(allocate(BallState, num_worlds, device)))
+        self.in_view = torch.ones(num_worlds, dtype=torch.bool, device=device)
         self.nearest_paddle_distance = torch.zeros(num_worlds, device=device)
         matrix = params.matrix(num_worlds, device)
         self.params = BallParams(*matrix.unbind(1))

@@ -5,7 +5,7 @@ import warp as wp
 from pace.sim.ball.arc import Arc, arc_position, arc_velocity
 from pace.sim.ball.events import on_top
 from pace.sim.ball.flight import Flight, Leg
-from pace.sim.ball.scene import FLOOR
+from pace.sim.ball.scene import FLOOR, NET
 from pace.sim.ball.state import ForecastArrays
 
 _BISECTIONS = wp.constant(20)
@@ -27,6 +27,7 @@ def clear_forecast(forecast: ForecastArrays, world: int):
     forecast.landing_own[world] = False
     forecast.landing_opponent[world] = False
     forecast.net_height[world] = wp.nan
+    forecast.net_touched[world] = False
 
 
 @wp.func
@@ -91,7 +92,9 @@ def note_apex(forecast: ForecastArrays, arc: Arc, after: Flight, intercept_x: fl
 
 @wp.func
 def note_contact(forecast: ForecastArrays, leg: Leg, after: Flight, world: int):
-    """Bounce and landing of a leg that ends on a surface."""
+    """Bounce, landing and a touch of the net before it, of a leg that ends on a surface."""
+    if leg.surface == NET and wp.isnan(forecast.landing_time[world]):
+        forecast.net_touched[world] = True
     top = on_top(leg)
     own = top and leg.arc.end[0] < 0.0
     if own and wp.isnan(forecast.bounce_time[world]):

@@ -83,6 +83,7 @@ class Forecast:
     landing_own: Bool  # the landing is on the own half of the table
     landing_opponent: Bool  # the landing is on the opponent's half
     net_height: NanFloat  # m, z of the ball when it first passes x = 0 towards the opponent
+    net_touched: Bool  # before the landing
 
 
 @struct_of(Forecast)
