@@ -142,11 +142,14 @@ class SensingConfig:
     # m; the ball counts as returned once it is sensed this much farther away than two control steps earlier; noise
     # alone stays below the threshold
     moved: float = 0.03
+    # m/s; a ball sensed farther from its last position than this allows is another ball (smashes: below 20 m/s)
+    fastest_ball: float = 25.0
 
     def __post_init__(self) -> None:
         check_range("sensing.mocap_delay", self.mocap_delay, lowest=0.0)
         check_range("sensing.noise_scale", self.noise_scale, lowest=0.0)
         require(self.moved >= 0, f"sensing.moved must not be negative, got {self.moved}")
+        require(self.fastest_ball > 0, f"sensing.fastest_ball must be positive, got {self.fastest_ball}")
 
 
 @dataclass

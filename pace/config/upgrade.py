@@ -11,6 +11,8 @@ from collections.abc import Callable, Sequence
 from copy import deepcopy
 from typing import Any
 
+import torch
+
 from pace.config.base import to_dict
 from pace.config.predictor import PredictorPriors
 from pace.config.renamed import with_current_names
@@ -70,6 +72,13 @@ def store_the_predictors_priors(config: Saved) -> None:
         predictor["priors"] = to_dict(PredictorPriors())
 
 
+def mark_no_launch(state: Saved) -> None:
+    """The delay line of the sensors gets a column, 1 in a new ball's first frame; it held no frame of an older ball."""
+    for process in state.get("processes", []):
+        line = process["env"]["sensing._line"]
+        process["env"]["sensing._line"] = torch.cat((line, torch.zeros_like(line[..., :1])), dim=-1)
+
+
 def _entry(config: Any, *keys: str) -> Saved:
     """The dictionary under ``keys``; a new empty one if there is none."""
     for key in keys:
@@ -87,7 +96,7 @@ CONFIG_UPGRADES: list[Upgrade] = [
 ]
 #: (format that it makes, function of the training state: ``ppo``, ``regression`` and ``processes``, each of them with
 #: ``env`` and ``random``). Tensors are in their places.
-STATE_UPGRADES: list[Upgrade] = []
+STATE_UPGRADES: list[Upgrade] = [(3, mark_no_launch)]
 
 
 def upgrade_config(config: Saved, version: int) -> Saved:

@@ -48,7 +48,6 @@ def readings(joints: int) -> dict[str, Port]:
         "joint_position": Port(joints, "rad", "in the order of joint_names, not relative to the nominal pose"),
         "joint_velocity": Port(joints, "rad/s", "in the order of joint_names"),
         "ball_position": Port(3, "m", "centre of the ball, world frame"),
-        "ball_launched": Port(1, "0 or 1", "1 in the step in which a new ball is seen first"),
     }
 
 
@@ -128,7 +127,6 @@ class DeployedPolicy(nn.Module):
         joint_position: Tensor,
         joint_velocity: Tensor,
         ball_position: Tensor,
-        ball_launched: Tensor,
         state: Tensor,
     ) -> tuple[Tensor, ...]:
         """One control step; see the class."""
@@ -138,8 +136,7 @@ class DeployedPolicy(nn.Module):
         started = past["started"] > 0.5
         track = Track(past["track"], past["turned"][:, 0] > 0.5, started[:, 0])
         estimates = {name: past[name] for name in self.onboard.estimates}
-        launched = ball_launched[:, 0] > 0.5
-        seen = self.onboard(sensing, past["action"], track, estimates, launched, started[:, 0])
+        seen = self.onboard(sensing, past["action"], track, estimates, started[:, 0])
         frame = torch.cat([function(seen).float() for function in self.seen], dim=1)
         older = torch.where(started, past["history"], frame.repeat(1, self.history - 1))
         observation = torch.cat((older, frame), dim=1)

@@ -104,7 +104,7 @@ class Onboard(nn.Module):
         return found
 
     def begin(self, sensing: Readings, action: Tensor) -> Signals:
-        """The first step of an episode, with a new ball."""
+        """The first step of an episode."""
         track = self.track.begin(sensing.ball_position)
         return self._complete(sensing, action, track, lambda name, reads: self.estimate(name).begin(**reads))
 
@@ -114,17 +114,15 @@ class Onboard(nn.Module):
         action: Tensor,
         track: Track,
         estimates: Mapping[str, Tensor],
-        new_ball: Tensor,
         started: Tensor | None = None,
     ) -> Signals:
         """The signals after one more control step.
 
         Args: sensing: the readings; action (N, J) of the step; track, estimates: those of :class:`Signals` of the
-        previous step; new_ball (N,) bool: balls just launched; started (N,) bool: the other worlds begin as in
-        :meth:`begin`, and their previous step is ignored; ``None``: all have started.
+        previous step; started (N,) bool: the other worlds begin as in :meth:`begin`, and their previous step is
+        ignored; ``None``: all have started.
         """
-        new_ball = new_ball if started is None else new_ball | ~started
-        track = self.track(track.positions, track.turned, sensing.ball_position, new_ball)
+        track = self.track(track.positions, track.turned, sensing.ball_position, started)
 
         def advance(name: str, reads: dict[str, Tensor]) -> Tensor:
             later = self.estimate(name)(estimates[name], **reads)

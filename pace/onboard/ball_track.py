@@ -10,12 +10,14 @@ from torch import Tensor, nn
 from pace.config.base import ConfigError
 from pace.config.task import TaskConfig
 
+NET_X = 0.0  # m, world frame
+
 
 class Track(NamedTuple):
     """The track of a robot's ball.
 
     ``positions`` (N, 3 * frames) m, oldest first, the predictor's input (until a ball has been sensed that often, its
-    first position is repeated); ``turned`` (N,) bool, the ball was sensed moving away since its launch;
+    first position is repeated); ``turned`` (N,) bool, this ball was sensed moving away;
     ``something_to_hit`` (N,) bool, estimated from the sensed positions.
     """
 
@@ -25,9 +27,14 @@ class Track(NamedTuple):
 
 
 class BallTrack(nn.Module):
-    """Tracks each robot's ball.
+    """Tracks each robot's ball, and finds from its sensed positions alone that another ball is in play.
 
-    Args: config: ``predictor.frames``, ``sensing.moved`` and ``reward.nothing_to_hit``.
+    Two things begin a new track. A jump: the ball is sensed farther from its last position than a ball flies in a
+    control step. A reversal: a ball that moved away comes towards the robot again beyond the net, where only another
+    player or a serving machine sends it back.
+
+    Args: config: ``predictor.frames``, ``sensing.moved``, ``sensing.fastest_ball``, ``robot.control_dt`` and
+    ``reward.nothing_to_hit``.
     Errors: :class:`ConfigError` for fewer than three frames.
     """
 
@@ -38,6 +45,7 @@ class BallTrack(nn.Module):
             raise ConfigError(
                 f"predictor.frames must be at least 3, got {self.frames}: the ball's velocity is seen over 3"
             )
+        self.jump = config.sensing.fastest_ball * config.robot.control_dt  # m
         rule = config.reward.nothing_to_hit
         self.past_x, self.low_z, self.falling_x = rule["past_x"], rule["low_z"], rule["falling_x"]
 
@@ -46,16 +54,24 @@ class BallTrack(nn.Module):
         positions = sensed.repeat(1, self.frames)
         return self._judge(positions, torch.zeros_like(sensed[:, 0], dtype=torch.bool))
 
-    def forward(self, positions: Tensor, turned: Tensor, sensed: Tensor, new_ball: Tensor) -> Track:
+    def forward(self, positions: Tensor, turned: Tensor, sensed: Tensor, started: Tensor | None = None) -> Track:
         """The track after one more control step.
 
-        Args: positions (N, 3 * frames) m and turned (N,) bool of the step before; sensed (N, 3) m; new_ball (N,) bool
-        marks balls that were just launched.
+        Args: positions (N, 3 * frames) m and turned (N,) bool of the step before; sensed (N, 3) m; started (N,) bool:
+        the other robots begin as in :meth:`begin`; ``None``: all have started.
         """
+        new_ball = self.new_ball(positions, turned, sensed)
+        new_ball = new_ball if started is None else new_ball | ~started
         return self._judge(self.append(positions, sensed, new_ball), turned & ~new_ball)
 
+    def new_ball(self, positions: Tensor, turned: Tensor, sensed: Tensor) -> Tensor:
+        """(N,) bool: the ball that is now sensed at (N, 3) m is not the one that was tracked, or was sent again."""
+        jumped = (sensed - positions[:, -3:]).square().sum(1) > self.jump**2
+        towards = positions[:, -6] - sensed[:, 0] > self.moved  # over two steps
+        return jumped | (turned & towards & (sensed[:, 0] > NET_X))
+
     def append(self, positions: Tensor, sensed: Tensor, new_ball: Tensor) -> Tensor:
-        """The positions (N, 3 * frames) m alone, after one more control step."""
+        """The positions (N, 3 * frames) m alone, after one more control step; those of ``new_ball`` (N,) restart."""
         longer = torch.cat((positions[:, 3:], sensed), dim=1)
         return torch.where(new_ball.unsqueeze(1), sensed.repeat(1, self.frames), longer)
 

@@ -16,9 +16,9 @@ from pace.arrays.state import Stateful
 from pace.config.sim import SensingConfig
 from pace.sim.robot_state import RobotArrays, RobotState
 
-#: Columns of a motion-capture frame: base position 3, ball position 3, heading 2.
-MOCAP_COLUMNS = 8
-BASE, BALL, HEADING = wp.constant(0), wp.constant(3), wp.constant(6)
+#: Columns of a motion-capture frame: base position 3, ball position 3, heading 2; 1 in a new ball's first frame.
+FRAME_COLUMNS = 9
+BASE, BALL, HEADING, LAUNCHED = wp.constant(0), wp.constant(3), wp.constant(6), wp.constant(8)
 
 
 @wp.func
@@ -30,7 +30,7 @@ def _see(
     new_ball: bool,
     new_world: bool,
 ):
-    """Put a motion-capture frame into a world's delay line, newest first; a new ball or robot fills all of it."""
+    """Put a motion-capture frame into a world's delay line, newest first; a new world fills all of it."""
     if not new_world:
         for age in range(line.shape[0] - 1, 0, -1):
             for column in range(line.shape[1]):
@@ -40,18 +40,20 @@ def _see(
         line[0, BALL + i] = ball_position[world][i]
     for i in range(2):
         line[0, HEADING + i] = robot.heading[world][i]
-    for age in range(1, line.shape[0]):
-        for column in range(line.shape[1]):
-            ball_column = column >= BALL and column < HEADING
-            if new_world or (new_ball and ball_column):
+    line[0, LAUNCHED] = wp.where(new_ball and not new_world, 1.0, 0.0)
+    if new_world:
+        for age in range(1, line.shape[0]):
+            for column in range(line.shape[1]):
                 line[age, column] = line[0, column]
 
 
 @wp.func
 def _late(line: wp.array2d[wp.float32], delay: float, column: int) -> float:
-    """A column ``delay`` control steps ago, linear between frames."""
+    """A column ``delay`` control steps ago, linear between frames; between two balls it is that of the older one."""
     age = wp.min(int(delay), line.shape[0] - 2)
     share = delay - float(age)
+    if column >= BALL and column < HEADING and line[age, LAUNCHED] > 0.0 and share > 0.0:
+        share = 1.0
     return (1.0 - share) * line[age, column] + share * line[age + 1, column]
 
 
@@ -92,7 +94,7 @@ def _sense(
         row[6 + joint] += robot.joint_position[world, joint] - nominal[joint]
         row[6 + joints + joint] += robot.joint_velocity[world, joint]
     mocap = 6 + 2 * joints
-    for column in range(line.shape[2]):
+    for column in range(LAUNCHED):
         row[mocap + column] += _late(line[world], delay[world], column)
 
 
@@ -101,8 +103,8 @@ class Sensing(Stateful):
 
     All signals have uniform noise, whose amplitudes have a common scale that is sampled per world at reset. Motion
     capture (base position, heading, ball) also has a delay that is sampled per world at reset, linearly interpolated
-    between the control steps around it. A new ball is a new track of the motion-capture system: its first sample is its
-    first position.
+    between the control steps around it. A new ball is sensed once the delay has passed since its launch, the old one
+    until then; nothing tells them apart.
 
     Attributes: ``base_angular_velocity`` (N, 3) rad/s body frame, ``projected_gravity`` (N, 3), ``joint_position``
     (N, J) rad from the nominal pose, ``joint_velocity`` (N, J) rad/s, ``base_position`` (N, 3) m,
@@ -143,7 +145,7 @@ class Sensing(Stateful):
         self.base_angular_velocity, self.projected_gravity, self.joint_position, self.joint_velocity = views[:4]
         self.base_position, self.ball_position, self.heading, self.base_shift_noise = views[4:]
         frames = max(2, math.ceil(self._delays[1]) + 1)
-        self._line = torch.zeros(num_worlds, frames, MOCAP_COLUMNS, device=device)
+        self._line = torch.zeros(num_worlds, frames, FRAME_COLUMNS, device=device)
         self._delay = torch.zeros(num_worlds, device=device)  # in control steps
         self._scale = torch.ones(num_worlds, device=device)
         self._seed = torch.zeros(num_worlds, dtype=torch.int32, device=device)
@@ -154,10 +156,11 @@ class Sensing(Stateful):
         """(N,) control steps, delay of motion capture in each world."""
         return self._delay
 
-    def update(self, robot: RobotState, ball_position: Tensor, new_ball: Tensor) -> None:
-        """Sense the state after a control step; ``new_ball`` (N,) bool marks balls that were just launched."""
+    def update(self, robot: RobotState, ball_position: Tensor, launched: Tensor) -> None:
+        """Sense the state after a control step. ``launched`` (N,) bool: a new ball took the old one's place at its end,
+        so that no position between the two is sensed; the robot is not told."""
         self._seed.random_(generator=self._generator)
-        self._bound(robot, ball_position)[0](new_ball)
+        self._bound(robot, ball_position)[0](launched)
 
     def reset(self, mask: Tensor, robot: RobotState, ball_position: Tensor) -> None:
         """Sample new delays for the worlds of ``mask`` (N,) bool and sense them as if they had stood still so far."""

@@ -143,7 +143,7 @@ class TableTennis:
         self.game.count_serves()
         self._start_serves(next_serve)
         self.sensing.update(self.worlds.robot, self.worlds.ball.position, next_serve)
-        self.actor.step(next_serve)
+        self.actor.step()
         self._compute_truth()
         self._policy_history.push()
         self._critic_history.push()

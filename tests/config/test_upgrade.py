@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from pace.config import upgrade
 from pace.config.base import ConfigError, parse, to_dict
@@ -57,6 +58,14 @@ def test_upgrades_run_in_order_and_only_where_they_are_due(monkeypatch: pytest.M
     assert upgrade_state({"seen": []}, 2) == {"seen": [3, 4]}
     assert upgrade_state({"seen": []}, 1) == {"seen": [2, 3, 4]}
     assert upgrade_state({"seen": []}, 4) == {"seen": []}
+
+
+def test_the_delay_line_gets_a_column_for_launches() -> None:
+    line = torch.rand(3, 2, 8)
+    state = upgrade_state({"processes": [{"env": {"sensing._line": line.clone()}, "random": {}}]}, 2)
+    padded = state["processes"][0]["env"]["sensing._line"]
+    assert torch.equal(padded[..., :8], line)
+    assert padded[..., 8].tolist() == [[0.0, 0.0]] * 3
 
 
 @pytest.mark.parametrize("policy", sorted(path.name for path in Path("pretrained").glob("*/")))

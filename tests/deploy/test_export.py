@@ -266,23 +266,19 @@ def test_bad_input_is_one_line(
         DeployedPolicy(built_in_policy("zero", 1), make_model(make_config()))
 
 
-ROBOTS_OWN = set(readings(21)) - {"ball_launched"}
-
-
 def follow(controller: Any, policy: TaskPolicy) -> int:
     """Play the task beside the example's controller, which must say the same; balls after the first, and falls."""
     env = policy.make_env(1, "cpu", 4, ["sensing.base_shift=0.0", "engine.threads=1", "serve.serves_per_episode=0"])
-    new_ball, restarts, serves = False, 0, 0
+    restarts, serves = 0, 0
     for _ in range(200):
         frame = {name: value[0] for name, value in RawReadings(env, policy.config).numpy().items()}
         action = policy(env.policy_observation)
         expected = env.worlds.nominal + 0.25 * action[0]
-        found = controller({name: value for name, value in frame.items() if name in ROBOTS_OWN}, new_ball)
+        found = controller({name: frame[name] for name in readings(21)})
         assert np.abs(found - expected.numpy()).max() < 1e-5
         assert np.abs(controller.outputs["predicted_apex"] - env.actor.apex[0].numpy()).max() < 1e-5
         env.advance(action)
-        new_ball = bool(env.game.ends.next_serve)
-        serves += new_ball
+        serves += bool(env.game.ends.next_serve)
         if bool(env.terminated):
             env.reset_worlds(env.terminated)
             controller.restart()
@@ -312,7 +308,7 @@ def test_the_example_refuses_files_of_other_versions(
     model = onnx.load(str(exported[0]))
     onnx.helper.set_model_props(model, {"format": "1"})
     onnx.save(model, str(tmp_path / "old.onnx"))
-    with pytest.raises(ValueError, match="format 1, not 3: export it again"):
+    with pytest.raises(ValueError, match="format 1, not 4: export it again"):
         example.Controller(tmp_path / "old.onnx")
 
 

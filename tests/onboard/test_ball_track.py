@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 import torch
 import warp as wp
-from torch import Tensor
 
 from pace.arrays.launch import Launch
 from pace.config.base import ConfigError
@@ -13,9 +12,6 @@ from pace.onboard.ball_track import BallTrack
 from pace.task.game import rules_of
 from pace.task.rules import Rules, nothing_to_hit
 from tests.helpers.fakes import config
-
-NO = torch.zeros(1, dtype=torch.bool)
-YES = torch.ones(1, dtype=torch.bool)
 
 
 class Followed:
@@ -25,18 +21,55 @@ class Followed:
         self.step = BallTrack(config())
         self.track = self.step.begin(torch.tensor([sensed]))
 
-    def see(self, *sensed: float, new: Tensor = NO) -> None:
-        self.track = self.step(self.track.positions, self.track.turned, torch.tensor([sensed]), new)
+    def see(self, *sensed: float) -> None:
+        self.track = self.step(self.track.positions, self.track.turned, torch.tensor([sensed]))
+
+    @property
+    def new(self) -> bool:
+        """The track began with what was sensed last."""
+        return self.track.positions[0].tolist() == self.track.positions[0, -3:].tolist() * 5
 
 
-def test_it_is_oldest_first_and_restarts_with_a_new_ball() -> None:
+def test_it_is_oldest_first_and_restarts_with_a_ball_that_jumps() -> None:
     ball = Followed(1.3, 0.0, 1.0)
     assert ball.track.positions[0, 0::3].tolist() == pytest.approx([1.3] * 5)
     for x in (1.2, 1.1, 1.0):
         ball.see(x, 0.0, 1.0)
     assert ball.track.positions[0, 0::3].tolist() == pytest.approx([1.3, 1.3, 1.2, 1.1, 1.0])
-    ball.see(1.35, 0.0, 1.0, new=YES)
-    assert ball.track.positions[0, 0::3].tolist() == pytest.approx([1.35] * 5)
+    ball.see(1.49, 0.0, 1.0)  # 24.5 m/s
+    assert ball.track.positions[0, 0::3].tolist() == pytest.approx([1.3, 1.2, 1.1, 1.0, 1.49])
+    ball.see(1.99, 0.1, 1.0)  # 25.5 m/s
+    assert ball.track.positions[0, 0::3].tolist() == pytest.approx([1.99] * 5)
+
+
+def test_a_serve_after_a_return_that_ended_where_it_starts_is_found_by_its_reversal() -> None:
+    """The return ends within half a metre of the launch; the noise is twice the paper's, +-14 mm."""
+    generator = torch.Generator().manual_seed(5)
+    for end in torch.linspace(0.9, 1.8, 19).tolist():
+        ball = Followed(-1.5, 0.0, 1.0)
+        path = [-1.4 + (end + 1.4) * step / 30 for step in range(31)]  # 4 to 5.3 m/s
+        launch = [1.35 - 0.1 * (step + 0.5) for step in range(5)]  # 5 m/s, sensed half a step late
+        found = []
+        for step, x in enumerate(path + launch):
+            ball.see(x + 0.014 * float(2.0 * torch.rand((), generator=generator) - 1.0), 0.0, 1.0)
+            found += [step - len(path)] if ball.new else []
+        assert len(found) == 1
+        assert 0 <= found[0] <= 2
+        assert bool(ball.track.something_to_hit)
+
+
+def test_noise_begins_no_track_of_a_ball_that_rests_or_flies() -> None:
+    """Twice the paper's noise, +-14 mm on each axis; balls that lie, roll and fly away, turned or not."""
+    torch.manual_seed(6)
+    count, step = 4000, BallTrack(config())
+    speed = torch.empty(count).uniform_(-0.1, 8.0)  # m/s along x; the slowest roll towards the robot
+    start, turned = torch.tensor([0.5, 0.2, 0.8]).repeat(count, 1), torch.arange(count) % 2 == 0
+    track = step.begin(start)._replace(turned=turned)
+    for moment in range(1, 50):
+        start[:, 0] += speed * 0.02
+        sensed = start + 0.014 * (2.0 * torch.rand(count, 3) - 1.0)
+        assert not bool(step.new_ball(track.positions, track.turned, sensed).any()), moment
+        track = step(track.positions, track.turned, sensed)
 
 
 @pytest.mark.parametrize(
@@ -75,7 +108,7 @@ def test_a_ball_that_turned_away_stays_gone_until_the_next_one() -> None:
         ball.see(x, 0.0, 1.0)
     assert bool(ball.track.turned)
     assert not bool(ball.track.something_to_hit)
-    ball.see(1.35, 0.0, 1.0, new=YES)
+    ball.see(1.35, 0.0, 1.0)
     assert not bool(ball.track.turned)
     assert bool(ball.track.something_to_hit)
 
