@@ -178,7 +178,9 @@ def test_the_next_serve_begins_at_once_and_the_fifth_truncates() -> None:
         assert not env.truncated.any()
         assert float(env.game.clock.index[1]) == serve + 1
         assert float(env.worlds.ball.position[1, 0]) == pytest.approx(1.35)
+        env.advance(torch.zeros(N, 21))  # motion capture is late
         track = env.predictor_input[1].view(5, 3)
+        assert float(track[0, 0]) == pytest.approx(1.3, abs=0.07)
         assert torch.equal(track, track[:1].expand(5, 3))
     finish_serve(env, world)
     assert env.truncated.tolist() == world.tolist()
