@@ -72,11 +72,17 @@ def store_the_predictors_priors(config: Saved) -> None:
         predictor["priors"] = to_dict(PredictorPriors())
 
 
-def mark_no_launch(state: Saved) -> None:
-    """The delay line of the sensors gets a column, 1 in a new ball's first frame; it held no frame of an older ball."""
+def describe_the_frames(state: Saved) -> None:
+    """The sensors' delay line gets columns: 1 in a new ball's first frame, of which it held none with an older ball,
+    and 1 with the ball in view, as it always was; the sensed ball has an age (saved tasks had steps of 0.02 s).
+    """
     for process in state.get("processes", []):
-        line = process["env"]["sensing._line"]
-        process["env"]["sensing._line"] = torch.cat((line, torch.zeros_like(line[..., :1])), dim=-1)
+        env = process["env"]
+        line, delay = env["sensing._line"], env["sensing._delay"]
+        one = torch.ones_like(line[..., :1])
+        env["sensing._line"] = torch.cat((line, 0.0 * one, one), dim=-1)
+        env["sensing.ball_age"] = 0.02 * delay
+        env["sensing.ball_new"] = torch.ones_like(delay, dtype=torch.bool)
 
 
 def _entry(config: Any, *keys: str) -> Saved:
@@ -96,7 +102,7 @@ CONFIG_UPGRADES: list[Upgrade] = [
 ]
 #: (format that it makes, function of the training state: ``ppo``, ``regression`` and ``processes``, each of them with
 #: ``env`` and ``random``). Tensors are in their places.
-STATE_UPGRADES: list[Upgrade] = [(3, mark_no_launch)]
+STATE_UPGRADES: list[Upgrade] = [(3, describe_the_frames)]
 
 
 def upgrade_config(config: Saved, version: int) -> Saved:

@@ -172,6 +172,8 @@ def test_the_next_serve_begins_at_once_and_the_fifth_truncates() -> None:
     env.reset_worlds(torch.ones(N, dtype=torch.bool))
     world = torch.arange(N) == 1
     for serve in range(4):
+        env.worlds.ball.position[world] = torch.tensor([-3.0, 1.5, 1.0])
+        env.advance(torch.zeros(N, 21))  # the robot has seen it there
         finish_serve(env, world)
         assert env.serve_over.tolist() == world.tolist()
         assert int(env.serve_outcome[1]) == Outcome.MISS
