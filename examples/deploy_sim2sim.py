@@ -331,7 +331,9 @@ class Robot:
             **self._late[0],
         }
         amplitude = {name: self.noise * self.meta["sensing"][name] for name in truth}
-        return {n: v + amplitude[n] * self._random.uniform(-1.0, 1.0, v.shape) for n, v in truth.items()}
+        seen = {n: v + amplitude[n] * self._random.uniform(-1.0, 1.0, v.shape) for n, v in truth.items()}
+        age = PHYSICS_DT * (len(self._late) - 1)
+        return seen | {"ball_age": np.array([age]), "ball_new": np.ones(1)}  # a frame at each control step
 
     @property
     def blade(self) -> Blade:

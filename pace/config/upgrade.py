@@ -81,7 +81,7 @@ def describe_the_frames(state: Saved) -> None:
         line, delay = env["sensing._line"], env["sensing._delay"]
         one = torch.ones_like(line[..., :1])
         env["sensing._line"] = torch.cat((line, 0.0 * one, one), dim=-1)
-        env["sensing.ball_age"] = 0.02 * delay
+        env["sensing.ball_age"] = env["track.age"] = 0.02 * delay
         env["sensing.ball_new"] = torch.ones_like(delay, dtype=torch.bool)
 
 

@@ -48,6 +48,8 @@ class RawReadings:
         sensing = self._env.sensing
         frame = {name: getattr(sensing, name) for name in readings(0)}
         frame["joint_position"] = sensing.joint_position + self._env.worlds.nominal
+        frame["ball_age"] = sensing.ball_age.unsqueeze(1)
+        frame["ball_new"] = sensing.ball_new.float().unsqueeze(1)
         frame["state"] = self.state
         return {name: value.contiguous().numpy() for name, value in frame.items()}
 

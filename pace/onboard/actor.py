@@ -26,7 +26,9 @@ Advance = Callable[[str, dict[str, Tensor]], Tensor]
 class Readings(NamedTuple):
     """One frame of the sensors, as those of :class:`pace.sim.sensing.Sensing`: ``base_angular_velocity`` (N, 3) rad/s
     and ``projected_gravity`` (N, 3), body frame; ``base_position``, ``ball_position`` (N, 3) m and ``heading`` (N, 2),
-    world frame; ``joint_position`` (N, J) rad relative to the nominal pose, ``joint_velocity`` (N, J) rad/s."""
+    world frame; ``joint_position`` (N, J) rad relative to the nominal pose, ``joint_velocity`` (N, J) rad/s;
+    ``ball_age`` (N,) s since the ball's frame was captured, ``ball_new`` (N,) bool, it arrived since the last control
+    step (else the ball's last position is repeated)."""
 
     base_angular_velocity: Tensor
     base_position: Tensor
@@ -35,6 +37,8 @@ class Readings(NamedTuple):
     joint_position: Tensor
     joint_velocity: Tensor
     ball_position: Tensor
+    ball_age: Tensor
+    ball_new: Tensor
 
 
 @dataclass
@@ -105,7 +109,7 @@ class Onboard(nn.Module):
 
     def begin(self, sensing: Readings, action: Tensor) -> Signals:
         """The first step of an episode."""
-        track = self.track.begin(sensing.ball_position)
+        track = self.track.begin(sensing.ball_position, sensing.ball_age)
         return self._complete(sensing, action, track, lambda name, reads: self.estimate(name).begin(**reads))
 
     def forward(
@@ -122,7 +126,7 @@ class Onboard(nn.Module):
         previous step; started (N,) bool: the other worlds begin as in :meth:`begin`, and their previous step is
         ignored; ``None``: all have started.
         """
-        track = self.track(track.positions, track.turned, sensing.ball_position, started)
+        track = self.track(track, sensing.ball_position, sensing.ball_age, sensing.ball_new, started)
 
         def advance(name: str, reads: dict[str, Tensor]) -> Tensor:
             later = self.estimate(name)(estimates[name], **reads)

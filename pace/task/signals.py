@@ -75,7 +75,7 @@ def _allocate(onboard: Onboard, readings: Readings, action: Tensor) -> Signals:
     def zeros(*size: int, dtype: torch.dtype = torch.float32) -> Tensor:
         return torch.zeros(count, *size, dtype=dtype, device=action.device)
 
-    track = Track(zeros(3 * onboard.track.frames), zeros(dtype=torch.bool), zeros(dtype=torch.bool))
+    track = Track(zeros(3 * onboard.track.frames), zeros(dtype=torch.bool), zeros(dtype=torch.bool), zeros())
     estimates = {name: zeros(onboard.estimate(name).size) for name in onboard.estimates}
     return Signals(
         readings,

@@ -33,7 +33,7 @@ STATE = {
         "previous_action shift something_to_hit target"
     ),
     "statistics": "sums",
-    "track": "positions something_to_hit turned",
+    "track": "age positions something_to_hit turned",
     "worlds": "position previous_targets spin velocity",
     "worlds.drawn": "actuator_delay until_push",
     "worlds.drawn.ball": (

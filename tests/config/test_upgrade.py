@@ -75,6 +75,7 @@ def test_the_delay_line_gets_columns_and_the_ball_an_age() -> None:
     assert torch.equal(padded[..., :8], line)
     assert padded[..., 8:].tolist() == [[[0.0, 1.0]] * 2] * 3
     assert env["sensing.ball_age"].tolist() == pytest.approx([0.01] * 3)
+    assert env["track.age"].tolist() == env["sensing.ball_age"].tolist()
     assert env["sensing.ball_new"].all()
 
 

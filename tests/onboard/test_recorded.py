@@ -42,8 +42,10 @@ class Recording:
         with np.load(DATA / f"{name}.npz") as file:
             self.values = {key: torch.from_numpy(file[key]) for key in file.files}
         self.event = 0
-        names = (*Readings._fields, "base_shift_noise")
+        names = [name for name in (*Readings._fields, "base_shift_noise") if name not in ("ball_age", "ball_new")]
         self.sensing = SimpleNamespace(**{name: self.now(f"reading.{name}").clone() for name in names})
+        worlds = len(self.now("mask"))  # that commit had a frame in each step, of no known age
+        self.sensing.ball_age, self.sensing.ball_new = torch.zeros(worlds), torch.ones(worlds, dtype=torch.bool)
         self.action = self.now("reading.action").clone()
 
     def __len__(self) -> int:
@@ -61,7 +63,8 @@ class Recording:
         self.event = event
         self.action.copy_(self.now("reading.action"))
         for name, value in vars(self.sensing).items():
-            value.copy_(self.now(f"reading.{name}"))
+            if name not in ("ball_age", "ball_new"):
+                value.copy_(self.now(f"reading.{name}"))
 
     def expected(self, name: str) -> Tensor:
         """A signal by its name in :meth:`pace.onboard.actor.Signals.computed`."""
@@ -89,6 +92,8 @@ def test_every_signal_is_as_recorded(name: str) -> None:
             waiting = torch.where(begun, 0, torch.where(mask | (waiting > 0), waiting + 1, 0))
             assert bool((waiting <= LATEST).all())
         for signal, value in actor.computed().items():
+            if signal == "track.age":
+                continue
             now, expected = value[waiting == 0], recording.expected(signal)[waiting == 0]
             torch.testing.assert_close(now, expected, atol=TOLERANCE, rtol=TOLERANCE, msg=f"{signal}, event {event}")
     assert resets > 1
