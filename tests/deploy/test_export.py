@@ -114,7 +114,7 @@ def test_the_metadata_is_what_a_robot_needs(exported: tuple[Path, dict[str, floa
     }
     assert list(meta["state"]) == ["started", "action", "turned", "age", "track", "history"]
     assert meta["state"]["track"]["columns"] == [24, 24 + 15]
-    assert meta["state"]["history"]["columns"][1] == meta["inputs"]["state"]["size"] == 23 + 15 + 4 * 90
+    assert meta["state"]["history"]["columns"][1] == meta["inputs"]["state"]["size"] == 24 + 15 + 4 * 90
     assert meta["counters"]["updates"] == 3
     assert meta["source"].startswith(str(run))
     assert len(meta["git"]["commit"]) == 40
