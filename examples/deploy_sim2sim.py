@@ -28,7 +28,7 @@ import onnxruntime
 import onnxruntime.capi.onnxruntime_pybind11_state as ort  # type: ignore[import-not-found]
 
 SCENE = Path(__file__).resolve().parent.parent / "pace" / "sim" / "assets" / "scene.xml"
-FORMAT = 3  # of the metadata that is understood here
+FORMAT = 4  # of the metadata that is understood here
 GRAVITY = np.array([0.0, 0.0, -9.81])  # m/s^2
 PHYSICS_DT = 0.002  # s
 BALL_DT = 0.001  # s: a ball at 10 m/s moves by half its radius
@@ -76,14 +76,13 @@ class Controller:
         """Start from scratch, without earlier returns: after a fall, with another paddle, not with every ball."""
         self._state = np.zeros((1, self.meta["inputs"]["state"]["size"]), dtype=np.float32)
 
-    def __call__(self, readings: Mapping[str, Vector], new_ball: bool) -> Vector:
+    def __call__(self, readings: Mapping[str, Vector]) -> Vector:
         """Joint targets (J,) rad, in the order of ``meta["joint_names"]``.
 
-        Args: readings: the sensed inputs by name (``meta["inputs"]`` describes them), each of its own size;
-        new_ball: this is the first frame in which a new ball is seen.
+        Args: readings: the sensed inputs by name (``meta["inputs"]`` describes them), each of its own size.
         """
         frame = {name: np.asarray(value, dtype=np.float32)[None] for name, value in readings.items()}
-        frame |= {"ball_launched": np.full((1, 1), new_ball, dtype=np.float32), "state": self._state}
+        frame["state"] = self._state
         values = self._session.run(self._names, frame)
         self.outputs = {name: np.asarray(value)[0] for name, value in zip(self._names, values, strict=True)}
         self._state = self.outputs["state_next"][None]
@@ -359,11 +358,6 @@ class Robot:
         mujoco.mj_step1(self.model, self.data)  # poses and velocities of the new state
         self._late.append(self._mocap(ball))
 
-    def new_ball(self, ball: Vector) -> None:
-        """A new ball is a new track: its first sample is its first position."""
-        for frame in self._late:
-            frame["ball_position"] = ball.copy()
-
     def _mocap(self, ball: Vector) -> Frame:
         x_axis = self.data.body("Trunk").xmat[[0, 3]]
         heading = x_axis / max(float(np.linalg.norm(x_axis)), 1e-6)
@@ -380,7 +374,9 @@ class Robot:
             **self._late[0],
         }
         amplitude = {name: self.noise * self.meta["sensing"][name] for name in truth}
-        return {n: v + amplitude[n] * self._random.uniform(-1.0, 1.0, v.shape) for n, v in truth.items()}
+        seen = {n: v + amplitude[n] * self._random.uniform(-1.0, 1.0, v.shape) for n, v in truth.items()}
+        age = PHYSICS_DT * (len(self._late) - 1)
+        return seen | {"ball_age": np.array([age]), "ball_new": np.ones(1)}  # a frame at each control step
 
     @property
     def blade(self) -> Blade:
@@ -443,7 +439,6 @@ class Match:
         start = SERVE_START.copy()
         start[1] += self._random.uniform(-0.1, 0.1)
         self.ball.serve(start, np.array([self._random.uniform(*bounds) for bounds in self._ranges]))
-        self.robot.new_ball(self.ball.position)
 
     def play(self, serves: int) -> None:
         """Play so many serves; after a fall the robot is reset."""
@@ -459,12 +454,12 @@ class Match:
 
     def _rally(self) -> tuple[Referee, bool]:
         """One serve to its end: its referee, and whether the robot still stands."""
-        referee, played, new_ball = Referee(), 0.0, True
+        referee, played = Referee(), 0.0
         while played < self._rules["max_duration"] and self.ball.position[2] > self._rules["end_height"]:
-            contacts = self._control_step(new_ball)
+            contacts = self._control_step()
             for contact in contacts:
                 referee.see(contact)
-            played, new_ball = played + self.controller.control_dt, False
+            played += self.controller.control_dt
             if self.robot.lost:
                 referee.outcome = referee.outcome or "fall"
                 return referee, False
@@ -472,8 +467,8 @@ class Match:
                 break
         return referee, True
 
-    def _control_step(self, new_ball: bool) -> list[Contact]:
-        target = self.controller(self.robot.sense(), new_ball)
+    def _control_step(self) -> list[Contact]:
+        target = self.controller(self.robot.sense())
         contacts: list[Contact] = []
         struck: Contact | None = None
         for _ in range(round(self.controller.control_dt / PHYSICS_DT)):

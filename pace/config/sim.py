@@ -194,8 +194,34 @@ class RandomizationConfig:
 
 
 @dataclass
+class MocapConfig:
+    """Frames of a motion-capture system. The defaults are off: a frame a control step, as old as ``mocap_delay``."""
+
+    rate: float = 0.0  # Hz, of frames; 0: off
+    white_noise: float = 0.0  # m, standard deviation of each axis of base and ball, independent in each frame
+    slow_noise: float = 0.0  # m, standard deviation of each axis of base and ball, first-order autoregressive
+    slow_noise_time: float = 0.06  # s, its time constant
+    lost: float = 0.0  # probability that a frame is lost
+    gap_rate: float = 0.0  # 1/s, runs of lost frames that begin while there is none
+    gap: Range = field(default_factory=lambda: [0.0, 0.0])  # s, length of a run
+    jitter: Range = field(default_factory=lambda: [0.0, 0.0])  # s, delay of each frame besides sensing.mocap_delay
+    occlusion: float = 0.0  # m; a ball nearer than this to the centre of the paddle is hidden; 0: off
+
+    def __post_init__(self) -> None:
+        for name in ("rate", "white_noise", "slow_noise", "gap_rate", "occlusion"):
+            value = getattr(self, name)
+            require(0.0 <= value < math.inf, f"sensing.mocap.{name} must be finite and not negative, got {value}")
+        require(0.0 < self.slow_noise_time < math.inf, "sensing.mocap.slow_noise_time must be positive and finite")
+        require(0.0 <= self.lost <= 1.0, f"sensing.mocap.lost must lie within 0 and 1, got {self.lost}")
+        for name in ("gap", "jitter"):
+            value = getattr(self, name)
+            check_range(f"sensing.mocap.{name}", value, lowest=0.0)
+            require(value[1] < math.inf, f"sensing.mocap.{name} must be finite, got {value}")
+
+
+@dataclass
 class SensingConfig:
-    """Errors of the robot's sensors: uniform noise (+- amplitude) and delay."""
+    """Errors of the robot's sensors: uniform noise (+- amplitude), delay, and the frames of motion capture."""
 
     name: str
     base_angular_velocity: float  # rad/s
@@ -211,11 +237,15 @@ class SensingConfig:
     # m; the ball counts as returned once it is sensed this much farther away than two control steps earlier; noise
     # alone stays below the threshold
     moved: float = 0.03
+    # m/s; a ball sensed farther from its last position than this allows is another ball (smashes: below 20 m/s)
+    fastest_ball: float = 25.0
+    mocap: MocapConfig = field(default_factory=MocapConfig)
 
     def __post_init__(self) -> None:
         check_range("sensing.mocap_delay", self.mocap_delay, lowest=0.0)
         check_range("sensing.noise_scale", self.noise_scale, lowest=0.0)
         require(self.moved >= 0, f"sensing.moved must not be negative, got {self.moved}")
+        require(self.fastest_ball > 0, f"sensing.fastest_ball must be positive, got {self.fastest_ball}")
 
 
 @dataclass

@@ -11,6 +11,8 @@ from collections.abc import Callable, Sequence
 from copy import deepcopy
 from typing import Any
 
+import torch
+
 from pace.config.base import to_dict
 from pace.config.predictor import PredictorPriors
 from pace.config.renamed import with_current_names
@@ -131,6 +133,19 @@ def _split_spin(override: Any) -> list[Any]:
     return [f"serve.{name}={spin}" for name in SPINS] if equals and key.strip() == "serve.spin" else [override]
 
 
+def describe_the_frames(state: Saved) -> None:
+    """The sensors' delay line gets columns: 1 in a new ball's first frame, of which it held none with an older ball,
+    and 1 with the ball in view, as it always was; the sensed ball has an age (saved tasks had steps of 0.02 s).
+    """
+    for process in state.get("processes", []):
+        env = process["env"]
+        line, delay = env["sensing._line"], env["sensing._delay"]
+        one = torch.ones_like(line[..., :1])
+        env["sensing._line"] = torch.cat((line, 0.0 * one, one), dim=-1)
+        env["sensing.ball_age"] = env["track.age"] = 0.02 * delay
+        env["sensing.ball_new"] = torch.ones_like(delay, dtype=torch.bool)
+
+
 def _entry(config: Any, *keys: str) -> Saved:
     """The dictionary under ``keys``; a new empty one if there is none."""
     for key in keys:
@@ -150,7 +165,11 @@ CONFIG_UPGRADES: list[Upgrade] = [
 ]
 #: (format that it makes, function of the training state: ``ppo``, ``regression`` and ``processes``, each of them with
 #: ``env`` and ``random``). Tensors are in their places.
-STATE_UPGRADES: list[Upgrade] = [(3, add_what_rubber_and_air_sample), (3, add_the_pauses)]
+STATE_UPGRADES: list[Upgrade] = [
+    (3, add_what_rubber_and_air_sample),
+    (3, add_the_pauses),
+    (3, describe_the_frames),
+]
 
 
 def upgrade_config(config: Saved, version: int) -> Saved:

@@ -32,15 +32,10 @@ class RawReadings:
 
     def __init__(self, env: TableTennisEnv, config: TrainConfig) -> None:
         self._env, self._action = env, StateLayout(config).columns["action"]
-        self._launched = torch.zeros(env.num_worlds, 1)
         self.state = torch.zeros(env.num_worlds, input_ports(config)["state"].size)
 
-    def push(self, new_ball: Tensor, state: NDArray[np.float32]) -> None:
-        """One control step later: ``new_ball`` (N,) bool, ``state`` (N, S) that the graph gave.
-
-        The action in it becomes the one that was done.
-        """
-        self._launched = new_ball.float().unsqueeze(1)
+    def push(self, state: NDArray[np.float32]) -> None:
+        """One control step later: ``state`` (N, S) that the graph gave. Its action becomes the one that was done."""
         self.state = torch.from_numpy(state)
         self.state[:, self._action] = self._env.task_state.action
 
@@ -51,9 +46,11 @@ class RawReadings:
     def numpy(self) -> dict[str, NDArray[np.float32]]:
         """What onnxruntime takes."""
         sensing = self._env.sensing
-        frame = {name: getattr(sensing, name) for name in readings(0) if name != "ball_launched"}
+        frame = {name: getattr(sensing, name) for name in readings(0)}
         frame["joint_position"] = sensing.joint_position + self._env.worlds.nominal
-        frame |= {"ball_launched": self._launched, "state": self.state}
+        frame["ball_age"] = sensing.ball_age.unsqueeze(1)
+        frame["ball_new"] = sensing.ball_new.float().unsqueeze(1)
+        frame["state"] = self.state
         return {name: value.contiguous().numpy() for name, value in frame.items()}
 
 
@@ -87,7 +84,7 @@ def compare(session: Session, policy: TaskPolicy, config: ExportConfig) -> dict[
             largest[name] = difference if np.isnan(difference) else max(largest.get(name, 0.0), difference)
         env.advance(action + ACTION_NOISE * torch.randn(action.shape, generator=generator))
         done = env.terminated | env.truncated
-        readings.push(env.game.ends.next_serve, kept)
+        readings.push(kept)
         env.reset_worlds(done)
         readings.restart(done)
     return largest

@@ -47,8 +47,9 @@ def readings(joints: int) -> dict[str, Port]:
         "heading": Port(2, "1", "x axis of the trunk on the ground, world frame; towards the opponent: (1, 0)"),
         "joint_position": Port(joints, "rad", "in the order of joint_names, not relative to the nominal pose"),
         "joint_velocity": Port(joints, "rad/s", "in the order of joint_names"),
-        "ball_position": Port(3, "m", "centre of the ball, world frame"),
-        "ball_launched": Port(1, "0 or 1", "1 in the step in which a new ball is seen first"),
+        "ball_position": Port(3, "m", "centre of the ball, world frame; without a new frame its last"),
+        "ball_age": Port(1, "s", "time since the ball's frame was captured"),
+        "ball_new": Port(1, "0 or 1", "1: a frame with the ball arrived since the call before"),
     }
 
 
@@ -84,6 +85,7 @@ def state_parts(config: TaskConfig) -> dict[str, Part]:
         "started": Part(1, "0 or 1", "1 after the first call"),
         "action": Part(joints, "1", "the last action"),
         "turned": Part(1, "0 or 1", "the ball was seen moving away"),
+        "age": Part(1, "s", "of the ball's last frame"),
         "track": Part(3 * config.predictor.frames, "m", "the ball's last positions, oldest first"),
         "history": Part((observation.policy_history - 1) * frame, "-", "the last observations, oldest first"),
     }
@@ -128,18 +130,19 @@ class DeployedPolicy(nn.Module):
         joint_position: Tensor,
         joint_velocity: Tensor,
         ball_position: Tensor,
-        ball_launched: Tensor,
+        ball_age: Tensor,
+        ball_new: Tensor,
         state: Tensor,
     ) -> tuple[Tensor, ...]:
         """One control step; see the class."""
         body = (base_angular_velocity, base_position, projected_gravity, heading)
-        sensing = Readings(*body, joint_position - self.nominal, joint_velocity, ball_position)
+        ball = (ball_position, ball_age[:, 0], ball_new[:, 0] > 0.5)
+        sensing = Readings(*body, joint_position - self.nominal, joint_velocity, *ball)
         past = self.state.split(state)
         started = past["started"] > 0.5
-        track = Track(past["track"], past["turned"][:, 0] > 0.5, started[:, 0])
+        track = Track(past["track"], past["turned"][:, 0] > 0.5, started[:, 0], past["age"][:, 0])
         estimates = {name: past[name] for name in self.onboard.estimates}
-        launched = ball_launched[:, 0] > 0.5
-        seen = self.onboard(sensing, past["action"], track, estimates, launched, started[:, 0])
+        seen = self.onboard(sensing, past["action"], track, estimates, started[:, 0])
         frame = torch.cat([function(seen).float() for function in self.seen], dim=1)
         older = torch.where(started, past["history"], frame.repeat(1, self.history - 1))
         observation = torch.cat((older, frame), dim=1)
@@ -155,6 +158,7 @@ class DeployedPolicy(nn.Module):
             "started": torch.ones_like(action[:, :1]),
             "action": action,
             "turned": seen.track.turned.unsqueeze(1).float(),
+            "age": seen.track.age.unsqueeze(1),
             "track": seen.track.positions,
             "history": history,
         }

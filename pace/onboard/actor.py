@@ -26,7 +26,9 @@ Advance = Callable[[str, dict[str, Tensor]], Tensor]
 class Readings(NamedTuple):
     """One frame of the sensors, as those of :class:`pace.sim.sensing.Sensing`: ``base_angular_velocity`` (N, 3) rad/s
     and ``projected_gravity`` (N, 3), body frame; ``base_position``, ``ball_position`` (N, 3) m and ``heading`` (N, 2),
-    world frame; ``joint_position`` (N, J) rad relative to the nominal pose, ``joint_velocity`` (N, J) rad/s."""
+    world frame; ``joint_position`` (N, J) rad relative to the nominal pose, ``joint_velocity`` (N, J) rad/s;
+    ``ball_age`` (N,) s since the ball's frame was captured, ``ball_new`` (N,) bool, it arrived since the last control
+    step (else the ball's last position is repeated)."""
 
     base_angular_velocity: Tensor
     base_position: Tensor
@@ -35,6 +37,8 @@ class Readings(NamedTuple):
     joint_position: Tensor
     joint_velocity: Tensor
     ball_position: Tensor
+    ball_age: Tensor
+    ball_new: Tensor
 
 
 @dataclass
@@ -104,8 +108,8 @@ class Onboard(nn.Module):
         return found
 
     def begin(self, sensing: Readings, action: Tensor) -> Signals:
-        """The first step of an episode, with a new ball."""
-        track = self.track.begin(sensing.ball_position)
+        """The first step of an episode."""
+        track = self.track.begin(sensing.ball_position, sensing.ball_age)
         return self._complete(sensing, action, track, lambda name, reads: self.estimate(name).begin(**reads))
 
     def forward(
@@ -114,17 +118,15 @@ class Onboard(nn.Module):
         action: Tensor,
         track: Track,
         estimates: Mapping[str, Tensor],
-        new_ball: Tensor,
         started: Tensor | None = None,
     ) -> Signals:
         """The signals after one more control step.
 
         Args: sensing: the readings; action (N, J) of the step; track, estimates: those of :class:`Signals` of the
-        previous step; new_ball (N,) bool: balls just launched; started (N,) bool: the other worlds begin as in
-        :meth:`begin`, and their previous step is ignored; ``None``: all have started.
+        previous step; started (N,) bool: the other worlds begin as in :meth:`begin`, and their previous step is
+        ignored; ``None``: all have started.
         """
-        new_ball = new_ball if started is None else new_ball | ~started
-        track = self.track(track.positions, track.turned, sensing.ball_position, new_ball)
+        track = self.track(track, sensing.ball_position, sensing.ball_age, sensing.ball_new, started)
 
         def advance(name: str, reads: dict[str, Tensor]) -> Tensor:
             later = self.estimate(name)(estimates[name], **reads)

@@ -43,10 +43,10 @@ class ActorSignals(Signals):
         """The predictor, if any."""
         return self.onboard.predictor
 
-    def step(self, new_ball: Tensor) -> None:
-        """Update after a control step: ``sensing`` and ``action`` are new; ``new_ball`` (N,) bool: just launched."""
+    def step(self) -> None:
+        """Update after a control step: ``sensing`` and ``action`` are new."""
         with torch.no_grad(), torch.autocast(self.action.device.type, enabled=False):
-            found = self.onboard(self.sensing, self.action, self.track, self.estimates, new_ball)
+            found = self.onboard(self.sensing, self.action, self.track, self.estimates)
         if self.predictor is not None:
             found.shift = found.shift + self._shift_noise
         new = found.computed()
@@ -75,7 +75,7 @@ def _allocate(onboard: Onboard, readings: Readings, action: Tensor) -> Signals:
     def zeros(*size: int, dtype: torch.dtype = torch.float32) -> Tensor:
         return torch.zeros(count, *size, dtype=dtype, device=action.device)
 
-    track = Track(zeros(3 * onboard.track.frames), zeros(dtype=torch.bool), zeros(dtype=torch.bool))
+    track = Track(zeros(3 * onboard.track.frames), zeros(dtype=torch.bool), zeros(dtype=torch.bool), zeros())
     estimates = {name: zeros(onboard.estimate(name).size) for name in onboard.estimates}
     return Signals(
         readings,

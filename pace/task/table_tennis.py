@@ -151,8 +151,8 @@ class TableTennis:
         if self._pauses is not None:
             self._pauses.step()
         self._start_serves(next_serve, next_serve)
-        self.sensing.update(self.worlds.robot, self.worlds.ball.position, next_serve)
-        self.actor.step(next_serve)
+        self.sensing.update(self.worlds.robot, self.worlds.ball.position, next_serve, self.worlds.ball.in_view)
+        self.actor.step()
         self._compute_truth()
         self._policy_history.push()
         self._critic_history.push()

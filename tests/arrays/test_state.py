@@ -29,13 +29,13 @@ STATE = {
     "policy": "frame observation",
     "rewards": "_weights reward sums values",
     "serves": "sampled",
-    "sensing": "_amplitude _delay _line _nominal _scale _sensed",
+    "sensing": "_amplitude _delay _line _nominal _scale _sensed ball_age ball_new",
     "state": (
         "action apex arrival base_error feet_distance foot_contact foot_load lost mocap_delay nominal "
         "previous_action shift something_to_hit target"
     ),
     "statistics": "sums",
-    "track": "positions something_to_hit turned",
+    "track": "age positions something_to_hit turned",
     "worlds": "in_view position previous_targets spin velocity",
     "worlds.drawn": "actuator_delay until_push",
     "worlds.drawn.ball": (

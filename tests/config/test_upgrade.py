@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from pace.config import upgrade
 from pace.config.base import ConfigError, parse, to_dict
@@ -73,6 +74,25 @@ def test_upgrades_run_in_order_and_only_where_they_are_due(monkeypatch: pytest.M
     assert upgrade_state({"seen": []}, 2) == {"seen": [3, 4]}
     assert upgrade_state({"seen": []}, 1) == {"seen": [2, 3, 4]}
     assert upgrade_state({"seen": []}, 4) == {"seen": []}
+
+
+def test_the_delay_line_gets_columns_and_the_ball_an_age() -> None:
+    line = torch.rand(3, 2, 8)
+    state = upgrade_state(
+        {
+            "processes": [
+                {"env": {"sensing._line": line.clone(), "sensing._delay": torch.full((3,), 0.5)}, "random": {}}
+            ]
+        },
+        2,
+    )
+    env = state["processes"][0]["env"]
+    padded = env["sensing._line"]
+    assert torch.equal(padded[..., :8], line)
+    assert padded[..., 8:].tolist() == [[[0.0, 1.0]] * 2] * 3
+    assert env["sensing.ball_age"].tolist() == pytest.approx([0.01] * 3)
+    assert env["track.age"].tolist() == env["sensing.ball_age"].tolist()
+    assert env["sensing.ball_new"].all()
 
 
 @pytest.mark.parametrize("policy", sorted(path.name for path in Path("pretrained").glob("*/")))

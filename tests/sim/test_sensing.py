@@ -63,14 +63,21 @@ def test_delays_are_drawn_per_world_at_reset() -> None:
     assert float(lag.mean()) == pytest.approx(0.007, abs=1e-4)
 
 
-def test_a_new_ball_is_seen_where_it_is_launched() -> None:
-    sensing, robot = make(clean(0.010, 0.010)), fake_robot(4)
+@pytest.mark.parametrize("delay", [0.0, 0.004, 0.010, 0.020, 0.030, 0.040])
+def test_a_launched_ball_is_sensed_once_the_delay_has_passed_and_never_between_two_balls(delay: float) -> None:
+    sensing, robot = make(clean(delay, delay)), fake_robot(4)
     sensing.reset(ALL, robot, ball_at(-2.0))
     robot.base_position[:, 0] += 0.1
     launched = torch.tensor([True, False, True, False])
-    sensing.update(robot, ball_at(1.35), launched)
-    torch.testing.assert_close(sensing.ball_position[:, 0], torch.tensor([1.35, -0.325, 1.35, -0.325]))
-    torch.testing.assert_close(sensing.base_position[:, 0], torch.full((4,), -1.75))  # the base did not jump
+    for step in range(5):
+        sensing.update(robot, ball_at(1.35 - 0.1 * step), launched if step == 0 else NONE)
+        seen = sensing.ball_position[:, 0]
+        flown = step - delay / DT  # control steps since the launch, as sensed
+        expected = 1.35 - 0.1 * flown if flown >= 0.0 else -2.0
+        torch.testing.assert_close(seen[launched], torch.full((2,), expected))
+        if step == 0 and delay == 0.010:  # a ball that flew there is sensed on its way, and so is the base
+            torch.testing.assert_close(seen[~launched], torch.full((2,), -0.325))
+            torch.testing.assert_close(sensing.base_position[:, 0], torch.full((4,), -1.75))
 
 
 def test_noise_is_uniform_with_the_configured_amplitude() -> None:

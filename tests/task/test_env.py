@@ -172,13 +172,17 @@ def test_the_next_serve_begins_at_once_and_the_fifth_truncates() -> None:
     env.reset_worlds(torch.ones(N, dtype=torch.bool))
     world = torch.arange(N) == 1
     for serve in range(4):
+        env.worlds.ball.position[world] = torch.tensor([-3.0, 1.5, 1.0])
+        env.advance(torch.zeros(N, 21))  # the robot has seen it there
         finish_serve(env, world)
         assert env.serve_over.tolist() == world.tolist()
         assert int(env.serve_outcome[1]) == Outcome.MISS
         assert not env.truncated.any()
         assert float(env.game.clock.index[1]) == serve + 1
         assert float(env.worlds.ball.position[1, 0]) == pytest.approx(1.35)
+        env.advance(torch.zeros(N, 21))  # motion capture is late
         track = env.predictor_input[1].view(5, 3)
+        assert float(track[0, 0]) == pytest.approx(1.3, abs=0.07)
         assert torch.equal(track, track[:1].expand(5, 3))
     finish_serve(env, world)
     assert env.truncated.tolist() == world.tolist()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -11,6 +13,8 @@ from torch import Tensor
 
 from pace.config.base import ConfigError
 from pace.config.task import PredictorConfig, TaskConfig
+from pace.onboard.actor import Readings
+from pace.onboard.kinematics import PaddleChain
 from pace.predictor.network import predictor_slices
 from pace.sim.sensing import Sensing
 from pace.task.env import TableTennisEnv
@@ -99,9 +103,10 @@ def fake_actor(task: TaskConfig, output: Tensor | None) -> ActorSignals:
     predictor = predict if output is not None else None
     action = torch.zeros(1, 21)
     actor = ActorSignals(task, sensing, action, fake_paddle, predictor)
+    actor.begin(YES)
     for x in (0.7, 0.6, 0.5):
         sensing.ball_position.copy_(torch.tensor([[x, 0.0, 1.1]]))
-        actor.step(torch.tensor([x == 0.7]))
+        actor.step()
     return actor
 
 
@@ -130,7 +135,7 @@ def test_shift_of_the_paper_uses_the_apex_and_a_clamped_target() -> None:
 def test_predictions_are_masked_while_nothing_is_to_hit() -> None:
     actor = fake_actor(config("sensing=clean"), PREDICTION)
     actor.sensing.ball_position.copy_(torch.tensor([[0.9, 0.0, 1.1]]))  # turned away
-    actor.step(NO)
+    actor.step()
     torch.testing.assert_close(actor.apex[0], IDLE)
     torch.testing.assert_close(actor.target[0], IDLE)
     assert float(actor.time) == 0.0
@@ -204,12 +209,67 @@ def policy_input(env: TableTennisEnv, change: Any = None) -> tuple[Tensor, Tenso
         change(env)
     no_new_ball = torch.zeros(8, dtype=torch.bool)
     env.sensing.update(env.worlds.robot, env.worlds.ball.position, no_new_ball)
-    env.actor.step(no_new_ball)
+    env.actor.step()
     env._compute_truth()
     env._policy_history.push()
     frame, positions = env.policy_observation.clone(), env.predictor_input.clone()
     env.load_state_dict(state)
     return frame, positions
+
+
+SHORT = ("engine=native", "engine.threads=1", "observation=memory", "serve.max_duration=0.4", "sensing=wide")
+
+
+def test_the_actor_sees_launches_hits_and_resets_through_sensed_frames_alone() -> None:
+    """Other modules, given only the readings, make the same policy observation, bit for bit."""
+    env = TableTennisEnv(config(*SHORT), 8, "cpu", 3, TruePredictor())
+    names = (*Readings._fields, "base_shift_noise")
+    sensing: Any = SimpleNamespace(**{name: getattr(env.sensing, name).clone() for name in names})
+    action, everyone = env.task_state.action.clone(), torch.ones(8, dtype=torch.bool)
+    chain = PaddleChain(env.worlds.model, env.worlds.spec.paddle)
+    apart = ActorSignals(env.config, sensing, action, chain, TruePredictor())
+    history = History(5, [partial(POLICY[name].function, apart) for name in env.config.observation.policy])
+
+    def read() -> None:
+        action.copy_(env.task_state.action)
+        for name in names:
+            getattr(sensing, name).copy_(getattr(env.sensing, name))
+
+    apart.begin(everyone)
+    history.fill(everyone)
+    launches, begun = 0, 0
+    for step in range(70):
+        env.advance(0.3 * torch.randn(8, 21))
+        read()
+        apart.step()
+        history.push()
+        assert torch.equal(history.observation, env.policy_observation), step
+        launches += int(env.game.ends.next_serve.sum())
+        done = env.terminated | env.truncated | (torch.arange(8) == step % 32)
+        env.reset_worlds(done)
+        begun += int(done.sum())
+        read()
+        apart.begin(done)
+        history.fill(done)
+        assert torch.equal(history.observation, env.policy_observation), step
+    assert launches >= 16
+    assert begun >= 16
+
+
+def test_other_launches_under_the_same_sensed_frames_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    one, other = (TableTennisEnv(config(*SHORT), 8, "cpu", 3, TruePredictor()) for _ in range(2))
+    monkeypatch.setattr(other.sensing, "update", lambda *_: other.sensing._sensed.copy_(one.sensing._sensed))
+    assert torch.equal(one.policy_observation, other.policy_observation)
+    different = 0
+    for step in range(40):
+        action = 0.3 * torch.randn(8, 21)
+        if step % 7 == 0:
+            other._start_serves(torch.arange(8) % 2 == 0)
+        one.advance(action)
+        other.advance(action)
+        assert torch.equal(one.policy_observation, other.policy_observation), step
+        different += int((one.game.ends.next_serve != other.game.ends.next_serve).sum())
+    assert different >= 8
 
 
 PRIVILEGED_ROBOT = (
