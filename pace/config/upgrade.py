@@ -144,6 +144,7 @@ def describe_the_frames(state: Saved) -> None:
         env["sensing._line"] = torch.cat((line, 0.0 * one, one), dim=-1)
         env["sensing.ball_age"] = env["track.age"] = 0.02 * delay
         env["sensing.ball_new"] = torch.ones_like(delay, dtype=torch.bool)
+        env["env.predictor_valid"] = env["game.target.something_to_hit"] & env["track.something_to_hit"]
 
 
 def _entry(config: Any, *keys: str) -> Saved:

@@ -27,7 +27,7 @@ from pace.task.state import TaskState
 from pace.task.statistics import Statistics
 
 #: The environment's own part of its state; the rest belongs to its parts.
-OWN_TENSORS = ("predictor_target", "predictor_time_to_apex", "_bad")
+OWN_TENSORS = ("predictor_target", "predictor_time_to_apex", "predictor_valid", "_bad")
 
 
 class TableTennis:
@@ -36,9 +36,10 @@ class TableTennis:
     Attributes, overwritten in place: ``policy_observation`` (N, Dp), ``critic_observation`` (N, Dc), ``reward``,
     ``terminated``, ``truncated`` (N,); for the predictor's regression ``predictor_input`` (N, 3 * frames) m sensed,
     oldest first, ``predictor_target`` (N, P) truth in the order of ``predictor.outputs`` (times from now, s),
-    ``predictor_valid`` (N,) bool, ``predictor_time_to_apex`` (N,) s; for evaluation ``serve_over`` (N,) bool,
-    ``serve_outcome`` (N,) int (:class:`pace.task.game.Outcome`) and ``serve_hit`` (N,) bool of the serves that ended in
-    this step. ``warmup_serves``: so many first serves of each world are left out of the statistics.
+    ``predictor_valid`` (N,) bool (there is something to hit, and the robot sees it), ``predictor_time_to_apex`` (N,) s;
+    for evaluation ``serve_over`` (N,) bool, ``serve_outcome`` (N,) int (:class:`pace.task.game.Outcome`) and
+    ``serve_hit`` (N,) bool of the serves that ended in this step. ``warmup_serves``: so many first serves of each world
+    are left out of the statistics.
 
     On a GPU a step and a reset are a CUDA graph each (:class:`pace.arrays.graph.CapturedCall`; ``engine.graph``): the
     configuration and the predictor's tensors are those of the second step, and are changed in place or not at all.
@@ -99,7 +100,7 @@ class TableTennis:
         self.reward = self.rewards.reward
         self.predictor_input = self.actor.track.positions
         self.predictor_target = torch.zeros_like(self.actor.prediction)
-        self.predictor_valid = self.task_state.something_to_hit
+        self.predictor_valid = torch.zeros(count, dtype=torch.bool, device=device)
         self.predictor_time_to_apex = torch.zeros(count, device=device)
         self._everyone = torch.ones(count, dtype=torch.bool, device=device)
         ends = self.game.ends
@@ -211,6 +212,9 @@ class TableTennis:
         self.task_state.derive()
         target, now = self.game.target, self.game.clock.time
         torch.sub(target.apex_time, now, out=self.predictor_time_to_apex)
+        # while the robot still sees the last ball, there is nothing that the new one's apex could be predicted from
+        torch.ge(now, self.sensing.ball_age, out=self.predictor_valid)
+        self.predictor_valid.logical_and_(target.something_to_hit).logical_and_(self.actor.track.something_to_hit)
         truth = {"apex": target.apex, "target": target.point, "target_time": (target.time - now).unsqueeze(-1)}
         torch.cat([truth[name] for name in self.config.predictor.outputs], dim=1, out=self.predictor_target)
 

@@ -18,7 +18,7 @@ STATE = {
     "": "generator",
     "actor": "apex paddle_normal paddle_position prediction shift target time",
     "critic": "frame observation",
-    "env": "_bad predictor_target predictor_time_to_apex",
+    "env": "_bad predictor_target predictor_time_to_apex predictor_valid",
     "game.clock": "fresh index played time",
     "game.closeness": "arrived arrived_now nearest previous",
     "game.ends": "hit lost next_serve outcome over truncated",

@@ -76,23 +76,35 @@ def test_upgrades_run_in_order_and_only_where_they_are_due(monkeypatch: pytest.M
     assert upgrade_state({"seen": []}, 4) == {"seen": []}
 
 
-def test_the_delay_line_gets_columns_and_the_ball_an_age() -> None:
-    line = torch.rand(3, 2, 8)
-    state = upgrade_state(
-        {
-            "processes": [
-                {"env": {"sensing._line": line.clone(), "sensing._delay": torch.full((3,), 0.5)}, "random": {}}
-            ]
-        },
-        2,
-    )
-    env = state["processes"][0]["env"]
+def old_env(worlds: int = 3) -> dict[str, torch.Tensor]:
+    """The tensors of an environment of format 2 that the upgrades to format 3 read."""
+    flags = torch.arange(worlds) % 2 == 0
+    return {
+        "sensing._line": torch.rand(worlds, 2, 8),
+        "sensing._delay": torch.full((worlds,), 0.5),
+        "worlds.drawn.ball.mass": torch.full((worlds,), 0.0027),
+        "worlds.position": torch.rand(worlds, 3),
+        "game.ends.over": flags,
+        "game.ends.outcome": flags.int(),
+        "game.target.something_to_hit": torch.ones_like(flags),
+        "track.something_to_hit": flags,
+    }
+
+
+def test_a_state_of_format_2_gets_what_the_true_world_keeps() -> None:
+    old = old_env()
+    env = upgrade_state({"processes": [{"env": dict(old), "random": {}}]}, 2)["processes"][0]["env"]
     padded = env["sensing._line"]
-    assert torch.equal(padded[..., :8], line)
+    assert torch.equal(padded[..., :8], old["sensing._line"])
     assert padded[..., 8:].tolist() == [[[0.0, 1.0]] * 2] * 3
     assert env["sensing.ball_age"].tolist() == pytest.approx([0.01] * 3)
     assert env["track.age"].tolist() == env["sensing.ball_age"].tolist()
     assert env["sensing.ball_new"].all()
+    assert env["env.predictor_valid"].tolist() == [True, False, True]
+    assert env["worlds.drawn.ball.paddle_tangential_restitution"].tolist() == [0.0] * 3
+    assert env["worlds.in_view"].all()
+    assert not env["game.pause.waiting"].any()
+    assert env["serves.sampled"].shape == (3, 9)
 
 
 @pytest.mark.parametrize("policy", sorted(path.name for path in Path("pretrained").glob("*/")))

@@ -256,6 +256,21 @@ def test_the_actor_sees_launches_hits_and_resets_through_sensed_frames_alone() -
     assert begun >= 16
 
 
+def test_the_predictor_learns_from_no_step_in_which_the_old_ball_is_sensed() -> None:
+    env = TableTennisEnv(config(*SHORT, "sensing.mocap_delay=[0.03,0.03]"), 16, "cpu", 3, TruePredictor())
+    launches = 0
+    for _ in range(60):
+        env.advance(torch.zeros(16, 21))
+        known = env.game.target.something_to_hit & env.actor.track.something_to_hit
+        assert torch.equal(env.predictor_valid, known & (env.game.clock.time >= env.sensing.ball_age))
+        new = env.game.ends.next_serve
+        launches += int(new.sum())
+        far = (env.sensing.ball_position - env.worlds.ball.position).norm(dim=1) > 0.5  # of the ball before
+        assert not env.predictor_valid[new & far & ~env.game.ends.lost].any()
+        env.reset_worlds(env.terminated)
+    assert launches >= 8
+
+
 def test_other_launches_under_the_same_sensed_frames_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     one, other = (TableTennisEnv(config(*SHORT), 8, "cpu", 3, TruePredictor()) for _ in range(2))
     monkeypatch.setattr(other.sensing, "update", lambda *_: other.sensing._sensed.copy_(one.sensing._sensed))
@@ -264,7 +279,7 @@ def test_other_launches_under_the_same_sensed_frames_change_nothing(monkeypatch:
     for step in range(40):
         action = 0.3 * torch.randn(8, 21)
         if step % 7 == 0:
-            other._start_serves(torch.arange(8) % 2 == 0)
+            other._start_serves(torch.arange(8) % 2 == 0, torch.arange(8) % 2 == 0)
         one.advance(action)
         other.advance(action)
         assert torch.equal(one.policy_observation, other.policy_observation), step
