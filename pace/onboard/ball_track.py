@@ -36,8 +36,7 @@ class BallTrack(nn.Module):
 
     Three things begin a new track. A jump: the ball is sensed farther from its last position than a ball flies between
     the two frames. A reversal: a ball that moved away comes towards the robot again beyond the net, where only another
-    player or a serving machine sends it back. A gap: no
-    frame showed the ball for longer than ``LONGEST_GAP``.
+    player or a serving machine sends it back. A gap: no frame showed the ball for longer than ``LONGEST_GAP``.
 
     Positions are one control step apart. If no frame arrived in a step, its position is extrapolated from the last two,
     in free fall; once the newest frame is older than ``LONGEST_GAP``, the ball stays where it is.
@@ -47,6 +46,8 @@ class BallTrack(nn.Module):
     Errors: :class:`ConfigError` for fewer than three frames.
     """
 
+    fall: Tensor
+
     def __init__(self, config: TaskConfig) -> None:
         super().__init__()
         self.frames, self.moved = config.predictor.frames, config.sensing.moved
@@ -55,6 +56,9 @@ class BallTrack(nn.Module):
                 f"predictor.frames must be at least 3, got {self.frames}: the ball's velocity is seen over 3"
             )
         self.fastest_ball, self.control_dt = config.sensing.fastest_ball, config.robot.control_dt
+        # m in a control step; a buffer, since a captured step brings nothing to the device
+        fall = torch.tensor([0.0, 0.0, GRAVITY * self.control_dt**2])
+        self.register_buffer("fall", fall, persistent=False)
         rule = config.reward.nothing_to_hit
         self.past_x, self.low_z, self.falling_x = rule["past_x"], rule["low_z"], rule["falling_x"]
 
@@ -89,8 +93,7 @@ class BallTrack(nn.Module):
     def _extrapolate(self, positions: Tensor, age: Tensor) -> Tensor:
         """(N, 3) m: the ball one control step after the last of its positions."""
         last = positions[:, -3:]
-        fall = positions.new_tensor([0.0, 0.0, GRAVITY * self.control_dt**2])
-        step = last - positions[:, -6:-3] - fall
+        step = last - positions[:, -6:-3] - self.fall
         return torch.where((age < LONGEST_GAP).unsqueeze(1), last + step, last)
 
     def append(self, positions: Tensor, sensed: Tensor, new_ball: Tensor) -> Tensor:

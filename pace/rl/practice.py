@@ -53,7 +53,7 @@ class ServePractice:
         self._randomizer = self._make_randomizer()
         self.serves = ServeSampler(config.serve, self.ball, self.generator)
         self._game = Game(config, self.ball, torch.tensor(STANDING, device=device).repeat(count, 1))
-        self._track = BallTrack(config)
+        self._track = BallTrack(config).to(device)
         self._path = torch.full((count, 2, 12), FAR_AWAY, device=device)
         self._path[:, :, 3:] = torch.tensor([1.0, *[0.0] * 8], device=device)  # a unit normal, at rest
         self._robot = allocate(RobotState, count, device, joints=0, feet=0, bodies=0)
