@@ -204,7 +204,7 @@ def test_a_perfect_swing_is_one_that_returns_the_ball() -> None:
     reward = recipe("swing").reward
     state = fake_state()
     material = BallParams.from_config(config().ball)
-    material = replace(material, paddle_friction=0.0, drag_coefficient=0.0, magnus_coefficient=0.0)
+    material = replace(material, paddle_friction=0.0, table_drag=0.0, table_lift=0.0)  # no air, no grip
     state.ball.params = material
     target, robot = state.game.target, state.robot
     target.arriving[:] = torch.tensor([-4.2, 0.3, -0.5])
