@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parent.parent
 NOTEBOOKS = {
     "01_physics.ipynb": (
         5,
-        ["bounce at x = -0.872 m after 0.459 s", "apex 1.055 m high", "come over the net and bounce on the robot's"],
+        ["bounce at x = -0.872 m after 0.459 s", "apex 1.035 m high", "come over the net and bounce on the robot's"],
     ),
     "02_policy.ipynb": (3, ["policy pretrained/pace, trained for", "serves ended", "this serve: met the ball after"]),
 }
