@@ -6,9 +6,11 @@ import math
 import mujoco
 import numpy as np
 import pytest
+import torch
 
 from pace.config.base import ConfigError
 from pace.config.training import load_train_config
+from pace.sim.engine.factory import make_engine
 from pace.sim.robot import (
     NOMINAL_KEY,
     build_model,
@@ -20,7 +22,8 @@ from pace.sim.robot import (
 )
 from tests.helpers.robot import CONTACT_BODIES, JOINT_NAMES
 
-#: joint: (lower, upper, effort of t1_paper) in rad and N m, from the maker's description; every other joint mirrors its sibling.
+#: joint: (lower, upper, effort of t1_paper) in rad and N m, from the maker's description; every other
+#: joint mirrors its sibling.
 LIMITS = {
     "Left_Shoulder_Pitch": (-3.31, 1.22, 18),
     "Left_Shoulder_Roll": (-1.74, 1.57, 18),
@@ -238,9 +241,11 @@ def test_wrong_armature_and_friction_are_config_errors(config, key, value):
 
 
 def test_listed_pairs_touch_with_the_scenes_friction_and_not_at_the_nominal_pose(config, model):
-    added = model.npair - len(config.robot.self_collision)
-    names = [[model.geom(int(g)).name for g in pair] for pair in zip(model.pair_geom1, model.pair_geom2, strict=True)]
-    assert {frozenset(pair) for pair in names[added:]} == {frozenset(pair) for pair in config.robot.self_collision}
+    pairs = {frozenset(pair) for pair in config.robot.self_collision}
+    assert len(pairs) == {"t1": 7, "t1_paper": 0}[config.robot.name]
+    ids = zip(model.pair_geom1, model.pair_geom2, strict=True)
+    assert {frozenset(model.geom(int(g)).name for g in pair) for pair in ids} >= pairs
+    assert model.npair == 35 + len(pairs)  # the MJCF's and these
     np.testing.assert_array_equal(model.pair_friction, np.tile(model.pair_friction[0], (model.npair, 1)))
     np.testing.assert_array_equal(model.pair_dim, 3)
     data = mujoco.MjData(model)
@@ -248,3 +253,31 @@ def test_listed_pairs_touch_with_the_scenes_friction_and_not_at_the_nominal_pose
     mujoco.mj_kinematics(model, data)
     for one, other in config.robot.self_collision:
         assert mujoco.mj_geomDistance(model, data, model.geom(one).id, model.geom(other).id, 1.0, None) > 0.02
+
+
+def test_a_forearm_driven_into_the_trunk_is_stopped_if_the_pair_is_listed(config):
+    """In free fall, with the shoulder's target far behind the trunk's surface."""
+    engine = dataclasses.replace(config.engine, name="native", threads=1)
+    model = build_model(config.robot, engine, config.ball.table)
+    arm = {"Shoulder_Pitch": -1.18, "Shoulder_Roll": 1.63, "Elbow_Pitch": 1.67, "Elbow_Yaw": 1.66}
+    qpos = torch.as_tensor(model.key_qpos, dtype=torch.float32)
+    qpos[:, 2] += 1.0
+    for name, angle in arm.items():
+        qpos[:, 7 + JOINT_NAMES.index(f"Right_{name}")] = angle
+    targets = qpos[:, None, 7:].clone()
+    targets[..., JOINT_NAMES.index("Right_Shoulder_Pitch")] = 0.0
+    sim, every = make_engine(model, engine, 1, "cpu", 1), torch.ones(1, dtype=torch.bool)
+    sim.reset(every, qpos, torch.zeros(1, model.nv))
+    data, gaps = mujoco.MjData(model), []
+    pair = [model.geom(name).id for name in ("right_forearm", "trunk")]
+    for _ in range(40):  # 0.4 s
+        sim.advance(targets, torch.zeros(1, model.nv))
+        data.qpos[:] = sim.qpos_path[0, -1].numpy()
+        mujoco.mj_kinematics(model, data)
+        gaps.append(mujoco.mj_geomDistance(model, data, *pair, 1.0, None))
+    assert gaps[0] > 0.02
+    if config.robot.name == "t1":
+        assert min(gaps) > -0.012  # it comes by 12 mm a physics step
+        assert -0.001 < gaps[-1] < 0.0
+    else:
+        assert gaps[-1] < -0.05
