@@ -120,7 +120,9 @@ def test_motors_armature_and_friction_reach_each_joint(config, model):
     if config.robot.name == "t1_paper":
         armature, friction = np.full(21, 0.01), np.zeros(21)
     else:
-        np.testing.assert_allclose(motor_lines(config.robot)[0], speed)
+        lines = motor_lines(config.robot)
+        assert lines is not None
+        np.testing.assert_allclose(lines[0], speed)
     np.testing.assert_allclose(joint_armature(config.robot), armature)
     np.testing.assert_allclose(model.dof_armature[6:], armature)
     np.testing.assert_allclose(joint_friction(config.robot), friction)
