@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from pace.config.task import SPINS
 from pace.config.training import load_train_config
 from pace.runs.metrics import markdown
 from pace.sim.ball.ball import BallParams, BallSim
@@ -51,8 +52,7 @@ def sample() -> Machine:
         "apex after the bounce (m)": flight.apex[:, 2],
         "time to the bounce (s)": flight.bounce_time,
     }
-    names = ("topspin", "sidespin", "corkscrew")
-    values |= {f"{name} (rad/s)": sampler.about[:, column] for column, name in enumerate(names)}
+    values |= {f"{name} (rad/s)": sampler.about[:, column] for column, name in enumerate(SPINS)}
     return Machine({name: value[good] for name, value in values.items()}, float((~good).float().mean()))
 
 
@@ -72,7 +72,7 @@ def draw(found: Machine, figure: Figure) -> None:
     groups = (
         ["speed (m/s)"],
         ["highest point before the bounce (m)", "apex after the bounce (m)"],
-        ["topspin (rad/s)", "sidespin (rad/s)", "corkscrew (rad/s)"],
+        [f"{name} (rad/s)" for name in SPINS],
     )
     for axes, names in zip(panels, groups, strict=True):
         for colour, name in zip(COLOURS, names, strict=False):
