@@ -6,11 +6,12 @@ from collections.abc import Iterable
 
 from pace.config.base import ConfigError, config_dirs, meant
 from pace.config.renamed import renamed_choice
+from pace.config.task import SPINS
 
 #: Old key -> new key, for every command.
 RENAMED_KEYS = {"run_dir": "out"}
 #: Old key -> the keys that it became.
-SPLIT_KEYS = {"serve.spin": ("serve.topspin", "serve.sidespin", "serve.corkscrew")}
+SPLIT_KEYS = {"serve.spin": tuple(f"serve.{axis}" for axis in SPINS)}
 
 
 def choices(group: str) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 ABLATIONS = ("no_predictor", "no_hit_guidance", "no_return_guidance", "paper_reward")
@@ -38,16 +38,24 @@ def with_current_names(saved: Mapping[str, Any]) -> dict[str, Any]:
         part = config.get(group)
         if isinstance(part, Mapping) and isinstance(part.get("name"), str):
             config[group] = {**part, "name": renamed_choice(group, part["name"])}
-    if isinstance(config.get("curriculum"), list):
-        config["curriculum"] = [_current_stage(stage) for stage in config["curriculum"]]
+    change_stages(config, lambda text: [current_override(text)])
     return config
 
 
-def _current_stage(stage: Any) -> Any:
-    """A stage of a curriculum; anything else is unchanged, and the check against the dataclasses reports it."""
-    if not isinstance(stage, Mapping) or not isinstance(stage.get("task"), list):
-        return stage
-    return {**stage, "task": [current_override(text) if isinstance(text, str) else text for text in stage["task"]]}
+def change_stages(config: dict[str, Any], change: Callable[[str], list[str]]) -> None:
+    """Replace each override in the stages of a saved curriculum by those that ``change`` gives for it, in new stages.
+
+    Anything else is unchanged, and the check against the dataclasses reports it.
+    """
+
+    def changed(stage: Any) -> Any:
+        if not isinstance(stage, Mapping) or not isinstance(stage.get("task"), list):
+            return stage
+        given = ([text] if not isinstance(text, str) else change(text) for text in stage["task"])
+        return {**stage, "task": [text for texts in given for text in texts]}
+
+    if isinstance(config.get("curriculum"), list):
+        config["curriculum"] = [changed(stage) for stage in config["curriculum"]]
 
 
 def current_override(text: str) -> str:

@@ -10,6 +10,9 @@ from pace.config.base import Range, check_range, require
 from pace.config.predictor import PredictorConfig
 from pace.config.sim import SensingConfig, SimConfig
 
+#: Axes of a serve's spin, each a key of its own.
+SPINS = ("topspin", "sidespin", "corkscrew")
+
 
 @dataclass
 class ServeConfig:
@@ -43,7 +46,7 @@ class ServeConfig:
     pause_ball: dict[str, float] = field(default_factory=lambda: {"lies": 1.0, "carried": 0.0, "hidden": 0.0})
 
     def __post_init__(self) -> None:
-        for name in ("x", "y", "z", "vx", "vy", "vz", "topspin", "sidespin", "corkscrew"):
+        for name in ("x", "y", "z", "vx", "vy", "vz", *SPINS):
             check_range(f"serve.{name}", getattr(self, name))
         check_range("serve.head_start", self.head_start, 0.0)
         self._check_attempts()

@@ -7,15 +7,14 @@ unless it was raised already since the last release. Functions change their argu
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from copy import deepcopy
 from typing import Any
 
-import torch
-
 from pace.config.base import to_dict
 from pace.config.predictor import PredictorPriors
-from pace.config.renamed import with_current_names
+from pace.config.renamed import change_stages, with_current_names
+from pace.config.task import SPINS
 
 #: Format that this version writes. 1: version 0.1.0 up to commit 43400ac; 2: up to 72b96bb, before the true world.
 FORMAT = 3
@@ -31,9 +30,6 @@ NEW_BALL_SAMPLES = (
     "paddle_tangential_restitution",
     "paddle_drilling_loss",
 )
-
-#: Keys of the spin about each axis.
-SPINS = ("topspin", "sidespin", "corkscrew")  # rad/s
 
 Saved = dict[str, Any]
 Upgrade = tuple[int, Callable[[Saved], None]]
@@ -93,8 +89,7 @@ def name_the_first_reading(config: Saved) -> None:
 
 def add_what_rubber_and_air_sample(state: Saved) -> None:
     """A world's samples of ``ball`` that did not exist: no tangential restitution, constant coefficients of the air."""
-    for process in state.get("processes") or ():
-        env = process["env"]
+    for env in _environments(state):
         rows = env["worlds.drawn.ball.mass"]
         for name in NEW_BALL_SAMPLES:
             env.setdefault(f"worlds.drawn.ball.{name}", rows.new_zeros(rows.shape))
@@ -105,45 +100,41 @@ def split_the_spin(config: Saved) -> None:
     serve = _entry(config, "serve")
     if "spin" in serve:
         spin = serve.pop("spin")
-        serve.update({name: list(spin) for name in SPINS})
-    stages = config.get("curriculum")
-    for stage in stages if isinstance(stages, list) else ():
-        if isinstance(stage, dict) and isinstance(stage.get("task"), list):
-            stage["task"] = [new for text in stage["task"] for new in _split_spin(text)]
+        serve.update({axis: list(spin) for axis in SPINS})
+    change_stages(config, _split_spin)
+
+
+def _split_spin(override: str) -> list[str]:
+    """``serve.spin=RANGE`` as an override of each axis; others unchanged."""
+    key, equals, spin = override.partition("=")
+    return [f"serve.{axis}={spin}" for axis in SPINS] if equals and key.strip() == "serve.spin" else [override]
 
 
 def add_the_pauses(state: Saved) -> None:
     """Without pauses no world waits, every ball is in view, and the next serve is sampled as the last one ends."""
-    for process in state.get("processes") or ():
-        env = process["env"]
+    for env in _environments(state):
         over, position = env["game.ends.over"], env["worlds.position"]
-        new = {"worlds.in_view": over.new_ones(over.shape), "game.pause.waiting": over.new_zeros(over.shape)}
-        new |= {
-            "game.pause.left": position.new_zeros(over.shape),
-            "game.pause.carried": position.new_zeros(position.shape),
-        }
-        new |= {"game.pause.kind": env["game.ends.outcome"].new_zeros(over.shape)}
-        new |= {"serves.sampled": position.new_zeros(len(position), 9)}
-        env.update({name: value for name, value in new.items() if name not in env})
-
-
-def _split_spin(override: Any) -> list[Any]:
-    """``serve.spin=RANGE`` as an override of each axis; others unchanged."""
-    key, equals, spin = override.partition("=") if isinstance(override, str) else ("", "", "")
-    return [f"serve.{name}={spin}" for name in SPINS] if equals and key.strip() == "serve.spin" else [override]
+        env.setdefault("worlds.in_view", over.new_ones(over.shape))
+        env.setdefault("game.pause.waiting", over.new_zeros(over.shape))
+        env.setdefault("game.pause.left", position.new_zeros(over.shape))
+        env.setdefault("game.pause.carried", position.new_zeros(position.shape))
+        env.setdefault("game.pause.kind", env["game.ends.outcome"].new_zeros(over.shape))
+        env.setdefault("serves.sampled", position.new_zeros(len(position), 9))
 
 
 def describe_the_frames(state: Saved) -> None:
     """The sensors' delay line gets columns: 1 in a new ball's first frame, of which it held none with an older ball,
     and 1 with the ball in view, as it always was; the sensed ball has an age (saved tasks had steps of 0.02 s).
     """
-    for process in state.get("processes", []):
-        env = process["env"]
-        line, delay = env["sensing._line"], env["sensing._delay"]
-        one = torch.ones_like(line[..., :1])
-        env["sensing._line"] = torch.cat((line, 0.0 * one, one), dim=-1)
-        env["sensing.ball_age"] = env["track.age"] = 0.02 * delay
-        env["sensing.ball_new"] = torch.ones_like(delay, dtype=torch.bool)
+    for env in _environments(state):
+        line, over = env["sensing._line"], env["game.ends.over"]
+        known = line.shape[-1]
+        wider = line.new_zeros(*line.shape[:-1], known + 2)
+        wider[..., :known] = line
+        wider[..., -1] = 1.0
+        env["sensing._line"] = wider
+        env["sensing.ball_age"] = env["track.age"] = 0.02 * env["sensing._delay"]
+        env["sensing.ball_new"] = over.new_ones(over.shape)
         env["env.predictor_valid"] = env["game.target.something_to_hit"] & env["track.something_to_hit"]
 
 
@@ -152,6 +143,12 @@ def name_the_papers_robot(config: Saved) -> None:
     robot = _entry(config, "robot")
     if robot.get("name") == "t1" and "self_collision" not in robot:
         robot["name"] = "t1_paper"
+
+
+def _environments(state: Saved) -> Iterator[Saved]:
+    """The saved tensors of each process's environment; none in a state without processes."""
+    for process in state.get("processes") or ():
+        yield process["env"]
 
 
 def _entry(config: Any, *keys: str) -> Saved:

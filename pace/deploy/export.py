@@ -16,6 +16,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import torch
 from omegaconf import DictConfig
 
@@ -32,7 +33,7 @@ from pace.deploy.graph import (
 )
 from pace.onboard.estimate import columns
 from pace.rl.policies import TaskPolicy, load_policy
-from pace.runs.run_folder import VERSIONS, git_state, make_out, versions
+from pace.runs.run_folder import VERSIONS, make_out, versions
 from pace.sim.robot import build_model, joint_armature, joint_friction, joint_gains, motor_lines, nominal_pose
 from pace.sim.robot_spec import RobotSpec
 from pace.task.observations import POLICY, layout
@@ -43,10 +44,9 @@ FORMAT = 4  # of the metadata; 4: one frame of readings, with the ball's age but
 PROCEDURE = (
     "Run at 1 / control_dt Hz: give the current readings, and as state the state_next of the call before. A state of "
     "zeros starts from scratch: at the start, after a fall and with another paddle, not with every ball: a new ball is "
-    "found from its positions. While no frame shows the ball, repeat "
-    "its last position with ball_new 0. Send joint_target to the position "
-    "controllers with the gains kp and kd. World frame: origin on the floor below the table's centre, x towards the "
-    "opponent, y to the robot's left, z up."
+    "found from its positions. While no frame shows the ball, repeat its last position with ball_new 0. Send "
+    "joint_target to the position controllers with the gains kp and kd. World frame: origin on the floor below the "
+    "table's centre, x towards the opponent, y to the robot's left, z up."
 )
 
 
@@ -90,7 +90,7 @@ def export_policy(policy: TaskPolicy, out: Path, config: ExportConfig) -> dict[s
             largest = max(differences.values())
             if not largest <= config.tolerance:  # also NaN
                 raise ExportError(f"onnxruntime and torch differ by {largest:.2g}, more than {config.tolerance:g}")
-            describe(file, metadata(policy, differences, config))
+            describe(file, metadata(policy, model, differences, config))
             file.replace(out)
     except OSError as error:
         raise ExportError(f"{out} cannot be written: {error}") from error
@@ -145,13 +145,14 @@ def describe(file: Path, content: Mapping[str, Any]) -> None:
     onnx.save(model, str(file))
 
 
-def metadata(policy: TaskPolicy, differences: Mapping[str, float], options: ExportConfig) -> dict[str, Any]:
-    """All that the robot's own code needs to know, ready for JSON."""
-    config = policy.config
+def metadata(
+    policy: TaskPolicy, model: mujoco.MjModel, differences: Mapping[str, float], options: ExportConfig
+) -> dict[str, Any]:
+    """All that the robot's own code needs to know, ready for JSON; ``model`` of the policy's robot."""
+    config, program = policy.config, versions()
     kp, kd, effort = joint_gains(config.robot).tolist()
     lines = motor_lines(config.robot)
     max_speed, stall_torque = (None, None) if lines is None else lines.tolist()
-    model = build_model(config.robot, config.engine, config.ball.table)
     return {
         "format": FORMAT,
         "procedure": PROCEDURE,
@@ -181,8 +182,8 @@ def metadata(policy: TaskPolicy, differences: Mapping[str, float], options: Expo
         "source": policy.source,
         "counters": dict(policy.counters),
         "training": training_versions(policy),
-        "git": git_state(Path(__file__).resolve().parent),
-        "versions": versions(),
+        "git": program["git"],
+        "versions": program,
         "check": {"largest_difference": dict(differences), **to_dict(options)},
     }
 

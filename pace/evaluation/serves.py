@@ -190,8 +190,8 @@ def play(env: TableTennisEnv, policy: TaskPolicy, recorder: ServeRecorder, on_co
     """
     total = env.num_worlds * recorder.quota
     serve = env.config.serve
-    longest = serve.max_duration + max(serve.pause[1], serve.first_pause[1])
-    longest = math.ceil(longest / env.worlds.control_dt) + 1
+    longest_s = serve.max_duration + max(serve.pause[1], serve.first_pause[1])
+    longest = math.ceil(longest_s / env.worlds.control_dt) + 1
     recorder.begin()
     for step in range(1, PATIENCE * longest * recorder.serves_per_world + 1):
         env.advance(policy(env.policy_observation))

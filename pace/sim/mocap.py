@@ -26,8 +26,9 @@ NEVER = wp.constant(1.0e9)
 
 @wp.struct
 class Cameras:
-    """The numbers of :class:`pace.config.sim.MocapConfig`, per frame: s, m, 1."""
+    """The numbers of :class:`pace.config.sim.MocapConfig`, per frame: s, m, 1; and the control step, s."""
 
+    control_dt: float
     period: float
     white: float
     slow: float
@@ -41,8 +42,11 @@ class Cameras:
 
 @wp.struct
 class Film:
-    """The state of N worlds' cameras: see :class:`Mocap`."""
+    """The state of N worlds' cameras, and what their owner sampled for them: see :class:`Mocap`."""
 
+    delay: wp.array[wp.float32]  # control steps
+    scale: wp.array[wp.float32]  # of the noise
+    amplitude: wp.array[wp.float32]  # m, 1: of the uniform noise, one a column of the values
     truth: wp.array3d[wp.float32]  # now and one control step ago
     slow: wp.array2d[wp.float32]  # m
     ring: wp.array3d[wp.float32]  # frames on their way
@@ -163,13 +167,9 @@ def _deliver(ring: wp.array2d[wp.float32], ball: bool, age: float, row: wp.array
 def _begin(
     mask: wp.array[wp.bool],
     seed: wp.array[wp.int32],
-    control_dt: float,
     cameras: Cameras,
     robot: RobotArrays,
     ball_position: wp.array[wp.vec3],
-    delay: wp.array[wp.float32],
-    scale: wp.array[wp.float32],
-    amplitude: wp.array[wp.float32],
     film: Film,
 ):
     """The masked worlds' robots know where they stand, from a frame that is as old as their delay; no other is sent."""
@@ -183,12 +183,12 @@ def _begin(
         film.ring[world, slot, AGE] = NEVER
         film.ring[world, slot, WAIT] = NEVER
     for column in range(VALUES):
-        error = _noise(cameras, amplitude, film.slow[world], column, seed[world], 0)
-        film.sensed[world, column] = film.truth[world, 0, column] + scale[world] * error
+        error = _noise(cameras, film.amplitude, film.slow[world], column, seed[world], 0)
+        film.sensed[world, column] = film.truth[world, 0, column] + film.scale[world] * error
     film.phase[world] = cameras.period * wp.randf(wp.rand_init(seed[world], SEQUENCES - 1))
     film.gap[world] = 0.0
-    film.base_age[world] = delay[world] * control_dt
-    film.ball_age[world] = delay[world] * control_dt
+    film.base_age[world] = film.delay[world] * cameras.control_dt
+    film.ball_age[world] = film.delay[world] * cameras.control_dt
     film.ball_new[world] = True
 
 
@@ -196,18 +196,15 @@ def _begin(
 def _advance(
     mask: wp.array[wp.bool],
     seed: wp.array[wp.int32],
-    control_dt: float,
     cameras: Cameras,
     robot: RobotArrays,
     ball_position: wp.array[wp.vec3],
     in_view: wp.array[wp.bool],
-    delay: wp.array[wp.float32],
-    scale: wp.array[wp.float32],
-    amplitude: wp.array[wp.float32],
     film: Film,
 ):
     """One control step of the cameras; in the worlds of the mask it ended with a launch."""
     world = wp.tid()
+    control_dt = cameras.control_dt
     for column in range(TRUTH):
         film.truth[world, 1, column] = film.truth[world, 0, column]
         film.truth[world, 0, column] = _truth(robot, ball_position, world, column)
@@ -215,14 +212,15 @@ def _advance(
     for slot in range(ring.shape[0]):
         ring[slot, AGE] = ring[slot, AGE] + control_dt
         ring[slot, WAIT] = ring[slot, WAIT] - control_dt
-    late, number = delay[world] * control_dt, wp.int32(0)
+    late, number = film.delay[world] * control_dt, wp.int32(0)
     time = cameras.period - film.phase[world]  # of the next frame, from the step's beginning
     while time <= control_dt:
         number += 1
         frame = ring[_oldest(ring)]
         _drift(cameras, slow, cameras.kept, seed[world], number)
         share = time / control_dt
-        _capture(cameras, truth, share, mask[world], scale[world], amplitude, slow, frame, seed[world], number)
+        noise = film.scale[world]
+        _capture(cameras, truth, share, mask[world], noise, film.amplitude, slow, frame, seed[world], number)
         if not in_view[world]:
             frame[BALL_SEEN] = 0.0
         film.gap[world] = _send(cameras, frame, film.gap[world], late, control_dt - time, seed[world], number)
@@ -268,23 +266,25 @@ class Mocap(Stateful):
         self._truth, self._slow, self._ring = zeros(2, TRUTH), zeros(6), zeros(frames, FRAME_COLUMNS)
         self._phase, self._gap, self._base_age = zeros(), zeros(), zeros()
         own = {name.removeprefix("_"): getattr(self, name) for name in self.STATE}
-        self._film = own | {"ball_age": ball_age, "ball_new": ball_new, "sensed": sensed}
-        self._given = {"control_dt": control_dt, "delay": delay, "scale": scale, "amplitude": amplitude}
-        self._given["cameras"] = cameras_of(config.mocap)
+        given = {"delay": delay, "scale": scale, "amplitude": amplitude}
+        self._film = given | own | {"ball_age": ball_age, "ball_new": ball_new, "sensed": sensed}
+        self._cameras = cameras_of(config.mocap, control_dt)
 
     def record(
         self, robot: RobotState, ball_position: Tensor, in_view: Tensor, seed: Tensor
     ) -> tuple[MaskedLaunch, MaskedLaunch]:
         """Launches of a control step (mask: the ball was launched at its end) and of a beginning, for these tensors."""
-        given = self._given | {"robot": robot, "ball_position": ball_position, "seed": seed, "film": self._film}
+        given = {"robot": robot, "ball_position": ball_position, "seed": seed}
+        given |= {"cameras": self._cameras, "film": self._film}
         advance = MaskedLaunch(_advance, self._count, self._device, in_view=in_view, **given)
         return advance, MaskedLaunch(_begin, self._count, self._device, **given)
 
 
-def cameras_of(config: MocapConfig) -> dict[str, float | list[float]]:
-    """The fields of :class:`Cameras`."""
+def cameras_of(config: MocapConfig, control_dt: float) -> dict[str, float | list[float]]:
+    """The fields of :class:`Cameras`; ``control_dt`` in s."""
     period = 1.0 / config.rate
     return {
+        "control_dt": control_dt,
         "period": period,
         "white": config.white_noise,
         "slow": config.slow_noise,

@@ -180,10 +180,10 @@ class Sensing(Stateful):
         self._delay = torch.zeros(num_worlds, device=device)  # in control steps
         self._scale = torch.ones(num_worlds, device=device)
         self._seed = torch.zeros(num_worlds, dtype=torch.int32, device=device)
-        self._in_view = torch.ones(num_worlds, dtype=torch.bool, device=device)
+        self._always = torch.ones(num_worlds, dtype=torch.bool, device=device)  # in view
         self._control_dt = control_dt
         self._mocap = self._make_mocap(config, 6 + 2 * joints) if config.mocap.rate > 0 else None
-        self._bound = Bound(self._record, robot=None, ball_position=(num_worlds, 3))
+        self._bound = Bound(self._record, robot=None, ball_position=(num_worlds, 3), in_view=(num_worlds,))
 
     def _make_mocap(self, config: SensingConfig, first: int) -> Mocap:
         """Motion capture with frames of its own, which writes the columns from ``first`` on."""
@@ -204,28 +204,29 @@ class Sensing(Stateful):
     def update(self, robot: RobotState, ball_position: Tensor, launched: Tensor, in_view: Tensor | None = None) -> None:
         """Sense the state after a control step. ``launched`` (N,) bool: a new ball took the old one's place at its end,
         so that no position between the two is sensed; the robot is not told. ``in_view`` (N,) bool: the cameras see
-        the ball, else no frame holds it; ``None``: always."""
+        the ball, else no frame holds it; ``None``: always. Give the same tensors each time, also to :meth:`reset`."""
         self._seed.random_(generator=self._generator)
-        self._in_view.fill_(True) if in_view is None else self._in_view.copy_(in_view)
-        for launch in self._bound(robot, ball_position)[0]:
+        for launch in self._bound(robot, ball_position, self._always if in_view is None else in_view)[0]:
             launch(launched)
 
-    def reset(self, mask: Tensor, robot: RobotState, ball_position: Tensor) -> None:
+    def reset(self, mask: Tensor, robot: RobotState, ball_position: Tensor, in_view: Tensor | None = None) -> None:
         """Sample new delays for the worlds of ``mask`` (N,) bool and sense them as if they had stood still so far."""
         self._seed.random_(generator=self._generator)
-        for launch in self._bound(robot, ball_position)[1]:
+        for launch in self._bound(robot, ball_position, self._always if in_view is None else in_view)[1]:
             launch(mask)
 
-    def _record(self, robot: RobotState, ball_position: Tensor) -> tuple[list[MaskedLaunch], list[MaskedLaunch]]:
+    def _record(
+        self, robot: RobotState, ball_position: Tensor, in_view: Tensor
+    ) -> tuple[list[MaskedLaunch], list[MaskedLaunch]]:
         """The launches of an update, and those of a reset."""
         sampled = {"seed": self._seed, "delays": self._delays, "scales": self._scales, "amplitude": self._amplitude}
-        truth = {"robot": robot, "ball_position": ball_position, "in_view": self._in_view, "nominal": self._nominal}
+        truth = {"robot": robot, "ball_position": ball_position, "in_view": in_view, "nominal": self._nominal}
         truth |= {"control_dt": self._control_dt, "own_frames": int(self._mocap is not None)}
         kept = {"ball_age": self.ball_age, "ball_new": self.ball_new}
         kept |= {"delay": self._delay, "scale": self._scale, "line": self._line, "sensed": self._sensed}
         given = sampled | truth | kept
         launches = [[MaskedLaunch(_sense, self._num_worlds, self._device, reset=reset, **given)] for reset in (0, 1)]
         if self._mocap is not None:
-            film = self._mocap.record(robot, ball_position, self._in_view, self._seed)
+            film = self._mocap.record(robot, ball_position, in_view, self._seed)
             launches = [[*before, after] for before, after in zip(launches, film, strict=True)]
         return launches[0], launches[1]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from pace.config.task import SPINS
 from pace.config.training import TrainConfig
 from pace.rl.practice import ServePractice
 from pace.sim.ball.ball import BallParams, BallSim
@@ -14,7 +15,6 @@ from pace.sim.randomization import BALL_LIMITS, SAMPLED_BALL_PARAMS
 from pace.task.resets import world_spin
 
 AXES = ("x", "y", "z")
-SPINS = ("topspin", "sidespin", "corkscrew")
 FAR_AWAY = 100.0  # m, position of the paddle
 
 

@@ -10,15 +10,17 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from pace.config.sim import TableConfig
+from pace.config.task import SPINS
 from pace.config.training import load_train_config
 from pace.runs.metrics import markdown
+from pace.sim.ball.aero import GRAVITY
 from pace.sim.ball.ball import BallParams, BallSim
 from pace.studies.common import COLOURS
 from pace.task.resets import ServeSampler
 
 COUNT = 100_000
 SEED = 0
-TABLE_HALF = (1.37, 0.7625)  # m, length of a half and half of the width
 QUANTILES = (0.05, 0.5, 0.95)
 
 
@@ -28,14 +30,14 @@ class Machine:
 
     values: dict[str, Tensor]
     bad: float  # share of balls that still land otherwise
+    court: TableConfig
 
 
 def sample() -> Machine:
     """Sample and forecast the balls, on a CPU."""
     config = load_train_config(["serve=machine"])
-    ball_config, engine = config.ball, config.engine
-    params = BallParams.from_config(ball_config)
-    ball = BallSim(COUNT, "cpu", params, ball_config.table, config.robot.control_dt, 1, engine.ball_dt)
+    own, dt = config.ball, config.engine.ball_dt
+    ball = BallSim(COUNT, "cpu", BallParams.from_config(own), own.table, config.robot.control_dt, 1, dt, own.air)
     sampler = ServeSampler(config.serve, ball, torch.Generator().manual_seed(SEED))
     everyone = torch.ones(COUNT, dtype=torch.bool)
     position, velocity, spin = sampler.sample(everyone)
@@ -47,13 +49,13 @@ def sample() -> Machine:
         "bounce y (m)": flight.bounce[:, 1],
         "speed (m/s)": velocity.norm(dim=1),
         "elevation (degrees)": torch.rad2deg(torch.atan2(velocity[:, 2], velocity[:, :2].norm(dim=1))),
-        "highest point before the bounce (m)": position[:, 2] + 0.5 * rise.square() / 9.81,
+        "highest point before the bounce (m)": position[:, 2] + 0.5 * rise.square() / GRAVITY,
         "apex after the bounce (m)": flight.apex[:, 2],
         "time to the bounce (s)": flight.bounce_time,
     }
-    names = ("topspin", "sidespin", "corkscrew")
-    values |= {f"{name} (rad/s)": sampler.about[:, column] for column, name in enumerate(names)}
-    return Machine({name: value[good] for name, value in values.items()}, float((~good).float().mean()))
+    values |= {f"{name} (rad/s)": sampler.about[:, column] for column, name in enumerate(SPINS)}
+    kept = {name: value[good] for name, value in values.items()}
+    return Machine(kept, float((~good).float().mean()), own.table)
 
 
 def table(found: Machine) -> str:
@@ -72,7 +74,7 @@ def draw(found: Machine, figure: Figure) -> None:
     groups = (
         ["speed (m/s)"],
         ["highest point before the bounce (m)", "apex after the bounce (m)"],
-        ["topspin (rad/s)", "sidespin (rad/s)", "corkscrew (rad/s)"],
+        [f"{name} (rad/s)" for name in SPINS],
     )
     for axes, names in zip(panels, groups, strict=True):
         for colour, name in zip(COLOURS, names, strict=False):
@@ -87,7 +89,7 @@ def draw(found: Machine, figure: Figure) -> None:
 
 def _draw_landing(axes: Axes, found: Machine) -> None:
     x, y = (found.values[name].numpy() for name in ("bounce x (m)", "bounce y (m)"))
-    length, width = TABLE_HALF
+    length, width = 0.5 * found.court.length, 0.5 * found.court.width
     axes.hist2d(y, x, bins=(45, 40), range=((-width, width), (-length, 0.0)), cmap="Blues")
     axes.set_aspect("equal")
     axes.set_xlabel("bounce, y (m)")

@@ -152,7 +152,8 @@ class TableTennis:
         if self._pauses is not None:
             self._pauses.step()
         self._start_serves(next_serve, next_serve)
-        self.sensing.update(self.worlds.robot, self.worlds.ball.position, next_serve, self.worlds.ball.in_view)
+        robot, ball = self.worlds.robot, self.worlds.ball
+        self.sensing.update(robot, ball.position, next_serve, ball.in_view)
         self.actor.step()
         self._compute_truth()
         self._policy_history.push()
@@ -178,7 +179,8 @@ class TableTennis:
         self._start_serves(mask, launched, self._head_start)
         for action in (self.task_state.action, self.task_state.previous_action):
             action.masked_fill_(mask.unsqueeze(-1), 0.0)
-        self.sensing.reset(mask, self.worlds.robot, self.worlds.ball.position)
+        robot, ball = self.worlds.robot, self.worlds.ball
+        self.sensing.reset(mask, robot, ball.position, ball.in_view)
         self.actor.begin(mask)
         self._compute_truth()
         self._policy_history.fill(mask)

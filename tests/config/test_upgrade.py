@@ -14,8 +14,9 @@ from pace.config import upgrade
 from pace.config.base import ConfigError, parse, to_dict
 from pace.config.overrides import override_task
 from pace.config.renamed import RENAMED_CHOICES
+from pace.config.task import SPINS
 from pace.config.training import TrainConfig, load_train_config
-from pace.config.upgrade import FORMAT, SPINS, upgrade_config, upgrade_state
+from pace.config.upgrade import FORMAT, upgrade_config, upgrade_state
 from pace.rl.policies import load_policy
 from pace.runs.checkpoint import META, load_checkpoint, read_meta
 from pace.runs.queue import Run, check_settings
