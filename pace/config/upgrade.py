@@ -16,8 +16,9 @@ from pace.config.predictor import PredictorPriors
 from pace.config.renamed import change_stages, with_current_names
 from pace.config.task import SPINS
 
-#: Format that this version writes. 1: version 0.1.0 up to commit 43400ac; 2: up to 72b96bb, before the true world.
-FORMAT = 3
+#: Format that this version writes. 1: version 0.1.0 up to commit 43400ac; 2: up to 72b96bb, before the true world;
+#: 3: up to 8d3869a, before the robot of the maker's newest numbers.
+FORMAT = 4
 
 #: Landing target of a saved configuration without one (released configuration).
 LANDING_TARGET = (1.15, 0.0)  # m
@@ -139,10 +140,11 @@ def describe_the_frames(state: Saved) -> None:
 
 
 def name_the_papers_robot(config: Saved) -> None:
-    """``t1`` without ``self_collision`` has the motors of today's ``t1_paper``."""
+    """``t1`` was what ``t1_paper`` is now, in the robot and in the stages of the curriculum."""
     robot = _entry(config, "robot")
-    if robot.get("name") == "t1" and "self_collision" not in robot:
+    if robot.get("name") == "t1":
         robot["name"] = "t1_paper"
+    change_stages(config, lambda text: ["robot=t1_paper" if text == "robot=t1" else text])
 
 
 def _environments(state: Saved) -> Iterator[Saved]:
@@ -167,7 +169,7 @@ CONFIG_UPGRADES: list[Upgrade] = [
     (2, store_the_predictors_priors),
     (3, name_the_first_reading),
     (3, split_the_spin),
-    (3, name_the_papers_robot),
+    (4, name_the_papers_robot),
 ]
 #: (format that it makes, function of the training state: ``ppo``, ``regression`` and ``processes``, each of them with
 #: ``env`` and ``random``). Tensors are in their places.
