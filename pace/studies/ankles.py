@@ -15,6 +15,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from pace.config.base import ConfigError
 from pace.config.overrides import override_task, without_reward
@@ -61,7 +62,7 @@ def motor() -> Motor:
     return Motor(float(pitch), robot.stall_ratio * float(pitch), float(speed), float(armature), float(roll / pitch))
 
 
-def ankle_columns(robot: RobotConfig) -> Array:
+def ankle_columns(robot: RobotConfig) -> NDArray[np.int64]:
     """Places (2, 2) of pitch and roll among the joints, a row for each side."""
     joints = RobotSpec.of(robot).joints
     return np.array([[joints.index(f"{side}_Ankle_{axis}") for axis in ("Pitch", "Roll")] for side in SIDES])

@@ -1,6 +1,6 @@
-"""The studies by name: engine parity, step sizes, solver settings, paddle reaction, motors, ankles, predictors and
-their error bounds, posture, adaptation to the paddle, on-board estimates, bf16 rounding in the update, the balls of a
-machine, the learning curves of the recipes that were tried, and the rooms of the package.
+"""The studies by name: engine parity, step sizes, solver settings, paddle reaction, motors, cost of the robots,
+ankles, predictors and their error bounds, posture, adaptation to the paddle, on-board estimates, bf16 rounding in
+the update, the balls of a machine, the learning curves of the recipes that were tried, and the rooms of the package.
 
 They print the tables of the pages in ``docs/results`` and draw their figures.
 """
@@ -27,6 +27,7 @@ from pace.studies import (
     predictor,
     reaction,
     recipe,
+    robots,
     rounding,
     senses,
     serves,
@@ -84,8 +85,12 @@ def study_solver(options: Options) -> None:
 
 def study_motors(options: Options) -> None:
     cost = motors.cost()
-    print(", ".join(f"{case} the limit {1e6 * spent:.1f} us" for case, spent in cost.items()), "a step of a world")
+    print(", ".join(f"{case} {1e6 * spent:.1f} us" for case, spent in cost.items()), "a step of a world")
     print(motors.table(motors.uses(_policies(options), options.worlds, options.serves)))
+
+
+def study_robots(options: Options) -> None:
+    print(robots.table(robots.costs()))
 
 
 def study_ankles(options: Options) -> None:
@@ -158,6 +163,7 @@ STUDIES = {
     "steps": study_steps,
     "solver": study_solver,
     "motors": study_motors,
+    "robots": study_robots,
     "ankles": study_ankles,
     "predictor": study_predictor,
     "posture": study_posture,

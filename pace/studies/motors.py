@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import mujoco
-import numpy as np
 import torch
-from mujoco.batch import Batch
 
 from pace.config.base import ConfigError
 from pace.config.sim import RobotConfig
@@ -20,10 +16,9 @@ from pace.config.training import load_train_config
 from pace.evaluation.serves import ServeRecorder, play, summarise
 from pace.rl.policies import TaskPolicy, load_policy
 from pace.runs.metrics import markdown
-from pace.sim.engine.native import stop_timers
 from pace.sim.robot import motor_lines
 from pace.sim.robot_spec import RobotSpec
-from pace.studies.common import ENDLESS, Array, model_of, study_config, study_spec
+from pace.studies.common import ENDLESS, Array, model_of, native_cost, study_config
 from pace.task.env import TableTennisEnv
 
 WITHOUT, WITH, PAPER = "t1 without the line", "t1", "t1_paper"
@@ -34,7 +29,6 @@ GROUPS = ("Right_Shoulder", "Right_Elbow", "Left_Shoulder", "Left_Elbow", "Waist
 SLACK = 1e-3  # of the stall torque: float32
 END = 0.02  # of a joint's range, from either end
 SEED = 3
-COST_STEPS = 10
 
 
 class MotorRecorder(ServeRecorder):
@@ -142,24 +136,10 @@ def table(found: Sequence[Use]) -> str:
 
 
 def cost(worlds: int = 256, repeats: int = 7) -> dict[str, float]:
-    """Processor time (s) of a physics step of one world, native, one thread: the least of ``repeats`` alternations.
-
-    Standing robots whose targets jump, so that some motors saturate.
-    """
-    stop_timers()
-    batches = {}
-    for case, ratio in ((WITHOUT, 0.0), (WITH, 2.0)):
-        config = study_config(physics_dt=0.002)
-        model = model_of(dataclasses.replace(config, robot=dataclasses.replace(config.robot, stall_ratio=ratio)))
-        batches[case] = (model, Batch(model, worlds, 1))
-    targets = np.random.default_rng(SEED).normal(0.0, 0.3, (worlds, 1, len(study_spec().joints)))
-    least = dict.fromkeys(batches, math.inf)
-    for _ in range(repeats):
-        for case, (model, batch) in batches.items():
-            control = np.repeat(model.key_qpos[0, 7:] + targets, COST_STEPS, axis=1)
-            batch.bind("qpos")[:], batch.bind("qvel")[:] = model.key_qpos[0], 0.0
-            batch.bind("qacc_warmstart")[:] = 0.0
-            started = time.process_time()
-            batch.rollout(COST_STEPS, control, int(mujoco.mjtState.mjSTATE_CTRL), ("qpos",))
-            least[case] = min(least[case], time.process_time() - started)
-    return {case: spent / (worlds * COST_STEPS) for case, spent in least.items()}
+    """Processor time (s) of a physics step of one world without the limit and with it (:func:`native_cost`)."""
+    config = study_config(physics_dt=0.002)
+    models = {
+        case: model_of(dataclasses.replace(config, robot=dataclasses.replace(config.robot, stall_ratio=ratio)))
+        for case, ratio in (("without the limit", 0.0), ("with it", 2.0))
+    }
+    return native_cost(models, worlds, repeats)
