@@ -185,12 +185,17 @@ class RandomizationConfig:
     table_tangential_restitution: Range = field(default_factory=lambda: [0.0, 0.0])  # added
     paddle_tangential_restitution: Range = field(default_factory=lambda: [0.0, 0.0])  # added
     paddle_drilling_loss: Range = field(default_factory=lambda: [0.0, 0.0])  # added
+    backlash: Range = field(default_factory=lambda: [0.0, 0.0])  # rad, play of every joint's gear
+    paddle_tilt: Range = field(default_factory=lambda: [0.0, 0.0])  # rad, of the face, in a random direction
+    paddle_shift: Range = field(default_factory=lambda: [0.0, 0.0])  # m, of its centre, in a random direction
 
     def __post_init__(self) -> None:
         for f in fields(self):
             if f.name != "name":
                 check_range(f"randomization.{f.name}", getattr(self, f.name))
         require(self.effort_scale[0] > 0, "randomization.effort_scale must be positive")
+        for name in ("actuator_delay", "backlash", "paddle_tilt", "paddle_shift"):
+            check_range(f"randomization.{name}", getattr(self, name), lowest=0.0)
 
 
 @dataclass

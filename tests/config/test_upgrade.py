@@ -106,6 +106,8 @@ def test_a_state_of_format_2_gets_what_the_true_world_keeps() -> None:
     assert env["worlds.in_view"].all()
     assert not env["game.pause.waiting"].any()
     assert env["serves.sampled"].shape == (3, 9)
+    assert env["worlds.drawn.backlash"].tolist() == [0.0] * 3
+    assert env["worlds.drawn.paddle_error"].tolist() == [[0.0] * 5] * 3
 
 
 @pytest.mark.parametrize("policy", sorted(path.name for path in Path("pretrained").glob("*/")))
