@@ -37,7 +37,7 @@ def joint_gains(robot: RobotConfig) -> NDArray[np.float64]:
 
     Errors: :class:`ConfigError` for a joint that no group of ``robot.joint_groups`` matches.
     """
-    groups = [_group(robot, name) for name in RobotSpec.of(robot).joints]
+    groups = [joint_group(robot, name) for name in RobotSpec.of(robot).joints]
     return np.array([(group.kp, group.kd, group.effort) for group in groups]).T
 
 
@@ -50,10 +50,14 @@ def motor_lines(robot: RobotConfig) -> NDArray[np.float64] | None:
     if not robot.stall_ratio:
         return None
     stall = robot.stall_ratio * joint_gains(robot)[2]
-    return np.array([[_group(robot, name).max_speed for name in RobotSpec.of(robot).joints], stall])
+    return np.array([[joint_group(robot, name).max_speed for name in RobotSpec.of(robot).joints], stall])
 
 
-def _group(robot: RobotConfig, name: str) -> JointGroup:
+def joint_group(robot: RobotConfig, name: str) -> JointGroup:
+    """The group of ``robot.joint_groups`` that counts for the joint ``name``.
+
+    Errors: :class:`ConfigError` if none matches.
+    """
     group = next((g for g in robot.joint_groups if any(part in name for part in g.match)), None)
     if group is None:
         raise ConfigError(f"robot.joint_groups: no group matches joint {name}")
@@ -93,7 +97,7 @@ def _set_motors(spec: mujoco.MjSpec, robot: RobotConfig) -> None:
         spec.joint(name).armature = robot.armature
         actuator = spec.actuator(name)
         if robot.stall_ratio:
-            _set_line(actuator, kp, kd, _group(robot, name).max_speed, robot.stall_ratio * effort)
+            _set_line(actuator, kp, kd, joint_group(robot, name).max_speed, robot.stall_ratio * effort)
         else:
             actuator.set_to_position(kp=kp, kv=kd)
         actuator.forcerange = [-effort, effort]
