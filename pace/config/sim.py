@@ -11,13 +11,21 @@ from pace.config.base import Range, check_range, require
 
 @dataclass
 class JointGroup:
-    """Gains and limits of the joints whose name contains one of ``match``."""
+    """Gains, limits, inertia and friction of the joints whose name contains one of ``match``."""
 
     match: list[str]
     kp: float  # N m / rad
     kd: float  # N m s / rad
     effort: float  # N m
     max_speed: float = 0.0  # rad/s, at which the motor has no torque; needed if robot.stall_ratio is on
+    armature: float | None = None  # kg m^2; None: robot.armature
+    friction: float = 0.0  # N m, dry
+
+    def __post_init__(self) -> None:
+        for name in ("armature", "friction"):
+            value = getattr(self, name)
+            known = value is None or 0 <= value < math.inf
+            require(known, f"robot.joint_groups {self.match}: {name} must be finite and not negative, got {value}")
 
 
 @dataclass
@@ -34,13 +42,17 @@ class RobotConfig:
     control_dt: float  # s
     action_scale: float  # rad per unit of action
     action_clip: float  # largest |action|
-    armature: float  # kg m^2
+    armature: float  # kg m^2, of joints whose group has none
     base_height: float  # m, base above the floor at reset
     joint_groups: list[JointGroup]  # the first match of a joint counts
     nominal_pose: dict[str, float]  # rad; joints not named are at 0
     stall_ratio: float = 0.0  # stall torque over effort; 0: full effort at any speed (earlier policies)
+    # pairs of geoms that touch each other, besides those that the MJCF lists
+    self_collision: list[list[str]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
+        for pair in self.self_collision:
+            require(len(set(pair)) == len(pair) == 2, f"robot.self_collision needs pairs of two geoms, got {pair}")
         require(self.control_dt > 0, "robot.control_dt must be positive")
         require(len(self.foot_sites) == 2, f"robot.foot_sites must name a left and a right sole, got {self.foot_sites}")
         known = self.stall_ratio == 0 or 1 <= self.stall_ratio < math.inf

@@ -147,6 +147,13 @@ def describe_the_frames(state: Saved) -> None:
         env["env.predictor_valid"] = env["game.target.something_to_hit"] & env["track.something_to_hit"]
 
 
+def name_the_papers_robot(config: Saved) -> None:
+    """``t1`` without ``self_collision`` has the motors of today's ``t1_paper``."""
+    robot = _entry(config, "robot")
+    if robot.get("name") == "t1" and "self_collision" not in robot:
+        robot["name"] = "t1_paper"
+
+
 def _environments(state: Saved) -> Iterator[Saved]:
     """The saved tensors of each process's environment; none in a state without processes."""
     for process in state.get("processes") or ():
@@ -169,6 +176,7 @@ CONFIG_UPGRADES: list[Upgrade] = [
     (2, store_the_predictors_priors),
     (3, name_the_first_reading),
     (3, split_the_spin),
+    (3, name_the_papers_robot),
 ]
 #: (format that it makes, function of the training state: ``ppo``, ``regression`` and ``processes``, each of them with
 #: ``env`` and ``random``). Tensors are in their places.

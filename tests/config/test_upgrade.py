@@ -69,6 +69,16 @@ def test_one_range_of_spin_is_that_of_each_axis() -> None:
         override_task(load_train_config(), ["serve.spin=[0.0,1.0]"])
 
 
+def test_the_robot_of_before_is_the_papers() -> None:
+    saved = old_config()
+    kept = upgrade_config(saved, 2)
+    assert kept["robot"]["name"] == "t1"  # it has self_collision
+    del saved["robot"]["self_collision"]
+    for name, version, expected in (("t1", 2, "t1_paper"), ("t1", FORMAT, "t1"), ("mine", 2, "mine")):
+        saved["robot"]["name"] = name
+        assert upgrade_config(saved, version)["robot"] == saved["robot"] | {"name": expected}
+
+
 def test_upgrades_run_in_order_and_only_where_they_are_due(monkeypatch: pytest.MonkeyPatch) -> None:
     steps = [(number, lambda state, number=number: state["seen"].append(number)) for number in (3, 2, 4)]
     monkeypatch.setattr(upgrade, "STATE_UPGRADES", steps)
