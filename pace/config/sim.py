@@ -256,6 +256,8 @@ class SensingConfig:
     moved: float = 0.03
     # m/s; a ball sensed farther from its last position than this allows is another ball (smashes: below 20 m/s)
     fastest_ball: float = 25.0
+    # s; a ball without a frame is extrapolated for so long, and one that is seen again after it counts as another
+    longest_gap: float = 0.1
     mocap: MocapConfig = field(default_factory=MocapConfig)
 
     def __post_init__(self) -> None:
@@ -263,6 +265,7 @@ class SensingConfig:
         check_range("sensing.noise_scale", self.noise_scale, lowest=0.0)
         require(self.moved >= 0, f"sensing.moved must not be negative, got {self.moved}")
         require(self.fastest_ball > 0, f"sensing.fastest_ball must be positive, got {self.fastest_ball}")
+        require(self.longest_gap >= 0, f"sensing.longest_gap must not be negative, got {self.longest_gap}")
 
 
 @dataclass
