@@ -60,7 +60,12 @@ def test_a_recipe_is_whole_and_of_this_version(name: str) -> None:
 def test_a_recipe_has_the_ball_that_it_was_trained_with(name: str) -> None:
     """The first reading of rubber: no springing back, constant coefficients of the air, sliding friction 0.25."""
     ball = recipe(name).ball
-    assert (ball.name, ball.drag_coefficient, ball.table_drag, ball.table_lift) == ("rubber_first_reading", 0.5, 0.0, 0.0)
+    assert (ball.name, ball.drag_coefficient, ball.table_drag, ball.table_lift) == (
+        "rubber_first_reading",
+        0.5,
+        0.0,
+        0.0,
+    )
     assert (ball.paddle_friction, ball.paddle_tangential_restitution, ball.paddle_drilling_loss) == (0.25, 0.0, 0.0)
 
 
