@@ -47,12 +47,16 @@ class RobotConfig:
     joint_groups: list[JointGroup]  # the first match of a joint counts
     nominal_pose: dict[str, float]  # rad; joints not named are at 0
     stall_ratio: float = 0.0  # stall torque over effort; 0: full effort at any speed (earlier policies)
-    # pairs of geoms that touch each other, besides those that the MJCF lists
+    # pairs of geoms that touch each other, besides those that the MJCF lists; a robot that has some counts as contacts
+    # of a body those with floor and table alone
     self_collision: list[list[str]] = field(default_factory=list)
+    reset_limits: dict[str, Range] = field(default_factory=dict)  # rad, within which a joint starts, besides its range
 
     def __post_init__(self) -> None:
         for pair in self.self_collision:
             require(len(set(pair)) == len(pair) == 2, f"robot.self_collision needs pairs of two geoms, got {pair}")
+        for joint, limits in self.reset_limits.items():
+            check_range(f"robot.reset_limits.{joint}", limits)
         require(self.control_dt > 0, "robot.control_dt must be positive")
         require(len(self.foot_sites) == 2, f"robot.foot_sites must name a left and a right sole, got {self.foot_sites}")
         known = self.stall_ratio == 0 or 1 <= self.stall_ratio < math.inf

@@ -148,10 +148,11 @@ def describe_the_frames(state: Saved) -> None:
 
 
 def name_the_papers_robot(config: Saved) -> None:
-    """``t1`` without ``self_collision`` has the motors of today's ``t1_paper``."""
+    """``t1`` was what ``t1_paper`` is now, in the robot and in the stages of the curriculum."""
     robot = _entry(config, "robot")
-    if robot.get("name") == "t1" and "self_collision" not in robot:
+    if robot.get("name") == "t1":
         robot["name"] = "t1_paper"
+    change_stages(config, lambda text: ["robot=t1_paper" if text == "robot=t1" else text])
 
 
 def _environments(state: Saved) -> Iterator[Saved]:
@@ -176,7 +177,7 @@ CONFIG_UPGRADES: list[Upgrade] = [
     (2, store_the_predictors_priors),
     (3, name_the_first_reading),
     (3, split_the_spin),
-    (3, name_the_papers_robot),
+    (4, name_the_papers_robot),
 ]
 #: (format that it makes, function of the training state: ``ppo``, ``regression`` and ``processes``, each of them with
 #: ``env`` and ``random``). Tensors are in their places.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pace.config.base import ConfigError
 from pace.config.sim import EngineConfig, JointGroup, RobotConfig, TableConfig
-from pace.sim.robot_spec import PADDLE, RobotSpec, model_path, read_scene
+from pace.sim.robot_spec import PADDLE, TOUCH, RobotSpec, model_path, read_scene
 
 #: Name of the keyframe: nominal pose, soles on the floor.
 NOMINAL_KEY = "nominal"
@@ -96,7 +96,9 @@ def build_model(robot: RobotConfig, engine: EngineConfig, table: TableConfig, vi
     """
     spec = read_scene(model_path(robot))
     _set_motors(spec, robot)
-    _add_pairs(spec, robot.self_collision)
+    if robot.self_collision:
+        _add_pairs(spec, robot.self_collision)
+        _count_the_world_alone(spec)
     _fit_table(spec, table)
     spec.option.timestep = engine.physics_dt
     spec.option.iterations = engine.solver_iterations
@@ -136,6 +138,17 @@ def _add_pairs(spec: mujoco.MjSpec, pairs: Sequence[Sequence[str]]) -> None:
             raise ConfigError(f"robot.self_collision: {' and '.join(pair)} are a pair already")
         listed.add(frozenset(pair))
         spec.add_pair(geomname1=pair[0], geomname2=pair[1])
+
+
+def _count_the_world_alone(spec: mujoco.MjSpec) -> None:
+    """Sensors that count a geom's contacts count those with floor and table, the geoms of the world, and no others.
+
+    A forearm that leans on the trunk is stopped, as on the robot. It is no contact of the kind that the paper's reward
+    punishes, a fall or a hit of the table, and counting it twice, for either part, would outweigh the whole play.
+    """
+    for sensor in spec.sensors:
+        if sensor.name.endswith(TOUCH):
+            sensor.reftype, sensor.refname = mujoco.mjtObj.mjOBJ_BODY, "world"
 
 
 def _set_line(actuator: mujoco.MjsActuator, kp: float, kd: float, speed: float, stall: float) -> None:

@@ -6,11 +6,9 @@ import math
 import mujoco
 import numpy as np
 import pytest
-import torch
 
 from pace.config.base import ConfigError
 from pace.config.training import load_train_config
-from pace.sim.engine.factory import make_engine
 from pace.sim.robot import (
     NOMINAL_KEY,
     build_model,
@@ -219,67 +217,8 @@ def test_wrong_joint_names_are_config_errors(config):
         joint_gains(groups)
 
 
-@pytest.mark.parametrize(
-    ("pairs", "message"),
-    [
-        ([["right_forearm", "tail"]], r"robot\.self_collision.*tail"),
-        ([["paddle", "trunk"]], r"robot\.self_collision.*paddle and trunk"),
-        ([["trunk", "left_forearm"], ["left_forearm", "trunk"]], r"robot\.self_collision.*left_forearm and trunk"),
-        ([["right_forearm"]], r"robot\.self_collision.*right_forearm"),
-        ([["right_forearm", "trunk", "head"]], r"robot\.self_collision.*right_forearm"),
-        ([["trunk", "trunk"]], r"robot\.self_collision.*trunk"),
-    ],
-)
-def test_wrong_pairs_are_config_errors(config, pairs, message):
-    with pytest.raises(ConfigError, match=message):
-        build_model(dataclasses.replace(config.robot, self_collision=pairs), config.engine, config.ball.table)
-
-
 @pytest.mark.parametrize("key", ["armature", "friction"])
 @pytest.mark.parametrize("value", [-0.1, math.inf, math.nan])
 def test_wrong_armature_and_friction_are_config_errors(config, key, value):
     with pytest.raises(ConfigError, match=rf"Hip_Pitch.*{key}"):
         dataclasses.replace(config.robot.joint_groups[0], **{key: value})
-
-
-def test_listed_pairs_touch_with_the_scenes_friction_and_not_at_the_nominal_pose(config, model):
-    pairs = {frozenset(pair) for pair in config.robot.self_collision}
-    assert len(pairs) == {"t1": 7, "t1_paper": 0}[config.robot.name]
-    ids = zip(model.pair_geom1, model.pair_geom2, strict=True)
-    assert {frozenset(model.geom(int(g)).name for g in pair) for pair in ids} >= pairs
-    assert model.npair == 35 + len(pairs)  # the MJCF's and these
-    np.testing.assert_array_equal(model.pair_friction, np.tile(model.pair_friction[0], (model.npair, 1)))
-    np.testing.assert_array_equal(model.pair_dim, 3)
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
-    mujoco.mj_kinematics(model, data)
-    for one, other in config.robot.self_collision:
-        assert mujoco.mj_geomDistance(model, data, model.geom(one).id, model.geom(other).id, 1.0, None) > 0.02
-
-
-def test_a_forearm_driven_into_the_trunk_is_stopped_if_the_pair_is_listed(config):
-    """In free fall, with the shoulder's target far behind the trunk's surface."""
-    engine = dataclasses.replace(config.engine, name="native", threads=1)
-    model = build_model(config.robot, engine, config.ball.table)
-    arm = {"Shoulder_Pitch": -1.18, "Shoulder_Roll": 1.63, "Elbow_Pitch": 1.67, "Elbow_Yaw": 1.66}
-    qpos = torch.as_tensor(model.key_qpos, dtype=torch.float32)
-    qpos[:, 2] += 1.0
-    for name, angle in arm.items():
-        qpos[:, 7 + JOINT_NAMES.index(f"Right_{name}")] = angle
-    targets = qpos[:, None, 7:].clone()
-    targets[..., JOINT_NAMES.index("Right_Shoulder_Pitch")] = 0.0
-    sim, every = make_engine(model, engine, 1, "cpu", 1), torch.ones(1, dtype=torch.bool)
-    sim.reset(every, qpos, torch.zeros(1, model.nv))
-    data, gaps = mujoco.MjData(model), []
-    pair = [model.geom(name).id for name in ("right_forearm", "trunk")]
-    for _ in range(40):  # 0.4 s
-        sim.advance(targets, torch.zeros(1, model.nv))
-        data.qpos[:] = sim.qpos_path[0, -1].numpy()
-        mujoco.mj_kinematics(model, data)
-        gaps.append(mujoco.mj_geomDistance(model, data, *pair, 1.0, None))
-    assert gaps[0] > 0.02
-    if config.robot.name == "t1":
-        assert min(gaps) > -0.012  # it comes by 12 mm a physics step
-        assert -0.001 < gaps[-1] < 0.0
-    else:
-        assert gaps[-1] < -0.05
