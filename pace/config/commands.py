@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from pace.config.base import require
+from pace.config.quality import QualityConfig, check_first_ball
 from pace.config.training import TrainConfig
 
 
@@ -88,6 +89,11 @@ class EvaluateConfig:
     sweep_serves_slow: int  # the same for mjwarp on a CPU
     sweep_rows: list[str]
     variations: VariationConfig
+    first_ball: list[float]  # s that robots stand ready before their first ball
+    first_ball_worlds: int  # robots for each of these times
+    first_ball_serve: str  # a name of configs/serve/
+    first_ball_kind: str  # what the ball does until then: a key of serve.pause_ball
+    quality: QualityConfig
     paper: dict[str, PaperRow]
     plugins: list[str] = field(default_factory=list)  # modules that add what the saved task needs
 
@@ -99,6 +105,7 @@ class EvaluateConfig:
         for name in ("serves", "sweep_serves", "sweep_serves_slow", "num_worlds"):
             require(getattr(self, name) >= 1, f"{name} must be at least 1, got {getattr(self, name)}")
         require(self.warmup_serves >= 0, f"warmup_serves must not be negative, got {self.warmup_serves}")
+        check_first_ball(self.first_ball, self.first_ball_worlds, self.first_ball_kind)
 
 
 @dataclass

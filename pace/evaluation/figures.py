@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from pace.config.sim import TableConfig
-from pace.evaluation.serves import PATH_STEPS, C, Row
+from pace.evaluation.records import C
+from pace.evaluation.serves import PATH_STEPS, Row
 from pace.task.game import Outcome
 
 if TYPE_CHECKING:

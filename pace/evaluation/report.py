@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from pace.config.commands import PaperRow
-from pace.evaluation.serves import COLUMNS, FAILURES, Row
+from pace.evaluation.records import COLUMNS, FAILURES
+from pace.evaluation.serves import Row
 
 JSON, CSV, MARKDOWN, SERVES = "evaluation.json", "evaluation.csv", "evaluation.md", "serves.csv"
 UNITS = {

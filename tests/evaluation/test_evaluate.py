@@ -18,7 +18,8 @@ from pace.config.overrides import override_task
 from pace.evaluation import evaluate, sweep
 from pace.evaluation.__main__ import main
 from pace.evaluation.report import clean, text_table
-from pace.evaluation.serves import COLUMNS, C, ServeRecorder, count_failures, evaluate_row, summarise, wilson
+from pace.evaluation.records import COLUMNS, C, count_failures, summarise, wilson
+from pace.evaluation.serves import ServeRecorder, evaluate_row
 from pace.evaluation.sweep import Variation, ball_presets, plan_cell, variations
 from pace.predictor.regression import BIN_NAMES
 from pace.rl.policies import built_in_policy, load_policy
