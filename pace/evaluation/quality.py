@@ -45,7 +45,7 @@ MEANS = {
     "lean": ("lean", 180.0 / math.pi),  # degrees
     "power": ("power", 1.0),  # W
 }
-PHASES = ("at_ball", "waiting")
+PHASES = ("at_ball", "after_hit", "waiting")
 ZONES = (2, 3)  # of the opponent's half along x and y
 
 
@@ -56,7 +56,12 @@ class QualityRecorder(ServeRecorder):
         super().__init__(env, warmup_serves, quota)
         self.config = config
         worlds, device = env.worlds, env.worlds.device
-        sizes = {"phases": len(PHASES), "feet": 2, "joints": len(worlds.spec.joints), "bodies": len(worlds.spec.contacts)}
+        sizes = {
+            "phases": len(PHASES),
+            "feet": 2,
+            "joints": len(worlds.spec.joints),
+            "bodies": len(worlds.spec.contacts),
+        }
         self.sums = allocate(QualitySums, env.num_worlds, device, **sizes)
         self._track = allocate(QualityTrack, env.num_worlds, device, **sizes)
         longest = math.ceil(env.config.serve.max_duration / worlds.control_dt)
@@ -88,6 +93,7 @@ class QualityRecorder(ServeRecorder):
         rules, dt = QualityRules(), self.env.worlds.control_dt
         rules.warmup, rules.quota = self._warmup, self.quota
         rules.window = max(1, round(self.config.sway_window / dt))
+        rules.after_hit = round(self.config.after_hit / dt)
         rules.calm_square, rules.slack = self.config.calm_speed**2, self.config.torque_slack
         return rules
 
@@ -113,7 +119,7 @@ class QualityRecorder(ServeRecorder):
         return counted[:: max(1, math.ceil(len(counted) / self.config.poses))]
 
     def quality(self) -> dict[str, Any]:
-        """Quality of play: see :data:`pace.evaluation.report.QUALITY_UNITS`."""
+        """Quality of play, by measure, in m, s, rad/s, W, degrees (lean) and shares of the time."""
         totals = {name: tensor.double().sum(0).cpu() for name, tensor in named_tensors(self.sums).items()}
         worlds, instants = self.env.worlds, totals["instants"].sum()
         records = self.records[:-1].cpu()
@@ -131,6 +137,7 @@ class QualityRecorder(ServeRecorder):
             "self_contacts": self._self_contacts(),
             **strikes(records, clear),
             "landing": landing(records, table, self.config.edge),
+            "thresholds": vars(self.config),
         }
 
     def _heights(self, mean: float) -> dict[str, float]:

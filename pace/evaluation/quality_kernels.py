@@ -11,9 +11,10 @@ from pace.task.game_state import GameArrays
 
 HEIGHT_BIN = wp.constant(0.001)  # m, of the histogram of the base's height
 HEIGHT_BINS = wp.constant(2000)
-AT_BALL, WAITING = wp.constant(0), wp.constant(1)  # phases of play: with and without a ball that can be hit
+#: Phases of play: with a ball that can be hit, just after a hit, and without either.
+AT_BALL, AFTER_HIT, WAITING = wp.constant(0), wp.constant(1), wp.constant(2)
 
-Phases = Annotated[Float, "phases"]  # (N, 2)
+Phases = Annotated[Float, "phases"]  # (N, 3)
 Counts = Annotated[Int, "phases"]
 
 
@@ -79,6 +80,7 @@ class QualityRules:
     warmup: int  # first serves, which are not counted
     quota: int  # serves that are
     window: int  # control steps
+    after_hit: int  # control steps
     calm_square: float  # (rad/s)^2
     slack: float
 
@@ -133,14 +135,15 @@ def _feet(
     contact: wp.array2d[wp.bool], counted: bool, lost: bool, phase: int, sums: SumArrays, track: TrackArrays, world: int
 ):
     """Feet that leave the floor, and instants without a foot on it. A reset puts both feet down."""
-    none = bool(True)
+    standing = wp.int32(0)
     for foot in range(contact.shape[1]):
         down = contact[world, foot]
-        none = none and not down
+        if down:
+            standing += 1
         if counted and track.down[world, foot] and not down:
             sums.lifted[world, phase] += 1
         track.down[world, foot] = down or lost
-    if counted and none:
+    if counted and standing == 0:
         sums.no_foot[world, phase] += 1
 
 
@@ -178,26 +181,35 @@ def _sway(robot: RobotArrays, on: bool, length: int, sums: SumArrays, track: Tra
 
 
 @wp.func
-def _recover(
-    game: GameArrays, square: float, calm_square: float, calms: wp.array[wp.int32], track: TrackArrays, world: int
-):
-    """Control steps from the hit of a counted serve until the joints stay slow to the serve's end.
-
-    The last number of the histogram ``calms`` counts the serves at whose end they are not.
-    """
+def _phase(game: GameArrays, rules: QualityRules, track: TrackArrays, world: int) -> int:
+    """The phase of the last control step, once the hit is known."""
     if game.referee.hit_now[world]:
         track.since_hit[world] = 0
         track.calm_from[world] = 0
     elif track.since_hit[world] >= 0:
         track.since_hit[world] += 1
     since = track.since_hit[world]
+    phase = int(WAITING)
+    if game.target.something_to_hit[world]:
+        phase = AT_BALL
+    elif since >= 0 and since < rules.after_hit:
+        phase = AFTER_HIT
+    return phase
+
+
+@wp.func
+def _recover(square: float, over: bool, calm_square: float, calms: wp.array[wp.int32], track: TrackArrays, world: int):
+    """Control steps from the hit of a counted serve until the joints stay slow to the serve's end.
+
+    The last number of the histogram ``calms`` counts the serves at whose end they are not.
+    """
+    since = track.since_hit[world]
     if since >= 0 and square > calm_square:
         track.calm_from[world] = since + 1
-    if since >= 0 and game.ends.over[world]:
+    if since >= 0 and over:
         never = calms.shape[0] - 1
         steps = wp.min(track.calm_from[world], never - 1)
         wp.atomic_add(calms, wp.where(track.calm_from[world] > since, never, steps), 1)
-        track.since_hit[world] = -1
 
 
 @wp.kernel
@@ -220,20 +232,20 @@ def watch(
     """Add the last control step of each world whose current serve is counted."""
     world = wp.tid()
     counts = played[world] >= wp.int64(rules.warmup) and counted[world] < wp.int64(rules.quota)
-    lost = game.ends.lost[world]
-    phase = wp.where(game.target.something_to_hit[world], AT_BALL, WAITING)
+    lost, over = game.ends.lost[world], game.ends.over[world]
+    phase = _phase(game, rules, track, world)
     _feet(foot_contact, counts, lost, phase, sums, track, world)
     _sway(robot, counts and phase == WAITING and not lost, rules.window, sums, track, world)
-    if not counts:
+    if counts:
+        square = _mean_square(robot, world)
+        sums.instants[world, phase] += 1
+        sums.joint_square[world, phase] += square
+        sums.foot_slide[world, phase] += foot_slide[world]
+        _base(robot, phase, heights, sums, world)
+        _joints(robot, qvel, effort_scale[world], limits, rules.slack, phase, sums, world)
+        for body in range(robot.body_contact.shape[1]):
+            if robot.body_contact[world, body] > 0.0:
+                sums.touches[world, body] += 1
+        _recover(square, over, rules.calm_square, calms, track, world)
+    if over or lost:
         track.since_hit[world] = -1
-        return
-    square = _mean_square(robot, world)
-    sums.instants[world, phase] += 1
-    sums.joint_square[world, phase] += square
-    sums.foot_slide[world, phase] += foot_slide[world]
-    _base(robot, phase, heights, sums, world)
-    _joints(robot, qvel, effort_scale[world], limits, rules.slack, phase, sums, world)
-    for body in range(robot.body_contact.shape[1]):
-        if robot.body_contact[world, body] > 0.0:
-            sums.touches[world, body] += 1
-    _recover(game, square, rules.calm_square, calms, track, world)

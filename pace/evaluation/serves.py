@@ -27,6 +27,7 @@ from pace.task.game import Outcome
 PATH_WORLDS = 6  # worlds whose base path is kept
 PATH_STEPS = 400  # control steps of it, 8 s
 PATIENCE = 4  # times the longest duration of the serves; beyond it serves keep missing the table
+ENDLESS = ("serve.serves_per_episode=0", "serve.end_after_hit=0")  # every ball is followed to its end
 STEPS_PER_LOOK = 10  # control steps between two reads of the counts: each read waits for the device
 
 OnCount = Callable[[int], None]
@@ -44,8 +45,9 @@ class ServeRecorder:
     Call :meth:`begin` after the worlds' reset, :meth:`observe` after each ``advance`` and before the reset of fallen
     worlds, :meth:`begin` again after that.
 
-    Attributes: ``records`` (N * quota + 1, columns), world by world, the last row unused; ``early`` (N * warmup_serves +
-    1, columns), the same of the first serves, NaN where one was bad; ``counted``, ``played``, ``bad`` (N,); ``finished`` (N,) bool, all its serves are counted and the pause after the last one is over; ``path``
+    Attributes: ``records`` (N * quota + 1, columns), world by world, the last row unused; ``early`` (N * warmup_serves
+    + 1, columns), the same of the first serves, NaN if one was bad; ``counted``, ``played``, ``bad`` (N,); ``finished``
+    (N,) bool, all its serves are counted and the pause after the last one is over; ``path``
     (T, W, 3) base x, y (m) and number of the serve, NaN where not filled.
     """
 
@@ -232,8 +234,7 @@ def evaluate_row(
     Errors: :class:`pace.config.ConfigError` for unknown names and keys.
     """
     started = time.perf_counter()
-    endless = ("serve.serves_per_episode=0", "serve.end_after_hit=0")
-    env = policy.make_env(num_worlds, device, seed, ["reset=evaluation", f"serve={serve}", *overrides, *endless])
+    env = policy.make_env(num_worlds, device, seed, ["reset=evaluation", f"serve={serve}", *overrides, *ENDLESS])
     recorder = (record or ServeRecorder)(env, warmup_serves, math.ceil(serves / num_worlds))
     play(env, policy, recorder, on_count)
     records = recorder.records[:-1].cpu()
