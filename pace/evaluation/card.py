@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from pace.config.renamed import current_override
-from pace.evaluation.report import markdown_table
+from pace.evaluation.quality_report import more_tables
+from pace.evaluation.text import markdown_table
 from pace.rl.policies import saved_config
 from pace.runs.checkpoint import load_checkpoint
 
@@ -57,7 +58,7 @@ def _evaluation(folder: Path, found: Mapping[str, Any]) -> str:
     table = markdown_table(
         ("serves", "number", "hit %", "success %", "falls per 1,000"), [_row(row) for row in found["rows"]]
     )
-    return f"## Evaluation\n\n`{command}`\n\n{table}"
+    return "\n\n".join(["## Evaluation", f"`{command}`", table, *more_tables(found, markdown_table)])
 
 
 def _sweep(found: Mapping[str, Any]) -> str:

@@ -17,9 +17,11 @@ from pace.config.commands import EvaluateConfig
 from pace.config.overrides import override_task
 from pace.evaluation import evaluate, sweep
 from pace.evaluation.__main__ import main
-from pace.evaluation.report import clean, text_table
-from pace.evaluation.serves import COLUMNS, C, ServeRecorder, count_failures, evaluate_row, summarise, wilson
+from pace.evaluation.records import COLUMNS, C, count_failures, summarise, wilson
+from pace.evaluation.report import clean
+from pace.evaluation.serves import ServeRecorder, evaluate_row
 from pace.evaluation.sweep import Variation, ball_presets, plan_cell, variations
+from pace.evaluation.text import text_table
 from pace.predictor.regression import BIN_NAMES
 from pace.rl.policies import built_in_policy, load_policy
 from pace.task.game import Outcome
@@ -49,7 +51,8 @@ def fake_env(worlds: int) -> SimpleNamespace:
     n = worlds
     flags = {name: torch.zeros(n, dtype=torch.bool) for name in ("serve_over", "terminated", "predictor_valid")}
     events = SimpleNamespace(
-        hit_point=torch.zeros(n, 3), hit_velocity_out=torch.zeros(n, 3), hit_rim=torch.zeros(n, dtype=torch.bool)
+        **{f"hit_{name}": torch.zeros(n, 3) for name in ("point", "velocity_out", "velocity_in", "relative_velocity")},
+        hit_rim=torch.zeros(n, dtype=torch.bool),
     )
     ball = SimpleNamespace(velocity=torch.tensor([-6.0, 0.1, 1.7]).repeat(n, 1), events=events)
     robot = SimpleNamespace(base_position=torch.tensor([-1.8, 0.3, 0.7]).repeat(n, 1))
@@ -229,7 +232,7 @@ def test_the_command_writes_what_it_says(
     assert run_main(monkeypatch, str(run), f"out={out}", "device=cpu", *small, *sweep, *few) == 0
     printed = capsys.readouterr().out
     names = {"evaluation.json", "evaluation.csv", "evaluation.md", "serves.csv", "sweep.json", "sweep.png"}
-    names |= {"strike_map.png", "landing_map.png", "footwork.png"}
+    names |= {"strike_map.png", "landing_map.png", "footwork.png", "by_ball.png"}
     assert {file.name for file in out.iterdir()} == names
     assert all(f"wrote {out / name}" in printed for name in names)
     assert "97.6" in printed  # the paper's hit rate stands beside ours

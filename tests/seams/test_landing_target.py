@@ -12,7 +12,8 @@ from pace.config.base import ConfigError, to_dict
 from pace.config.training import load_train_config
 from pace.config.upgrade import LANDING_TARGET, upgrade_config
 from pace.evaluation.__main__ import main as evaluate
-from pace.evaluation.serves import COLUMNS, evaluate_row
+from pace.evaluation.records import COLUMNS
+from pace.evaluation.serves import evaluate_row
 from pace.rl.policies import load_policy
 from pace.rl.train import main as train
 from pace.task.outcome import Outcome
