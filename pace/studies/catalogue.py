@@ -1,5 +1,5 @@
 """The studies by name: engine parity, step sizes, solver settings, paddle reaction, motors, predictors and their error
-bounds, posture, adaptation to the paddle, on-board estimates, bf16 rounding in the update, the balls of a machine, the
+bounds, adaptation to the paddle, on-board estimates, bf16 rounding in the update, the balls of a machine, the
 learning curves of the recipes that were tried, and the rooms of the package.
 
 They print the tables of the pages in ``docs/results`` and draw their figures.
@@ -22,7 +22,6 @@ from pace.studies import (
     learning_curves,
     motors,
     parity,
-    posture,
     predictor,
     reaction,
     recipe,
@@ -85,10 +84,6 @@ def study_motors(options: Options) -> None:
     cost = motors.cost()
     print(", ".join(f"{case} the limit {1e6 * spent:.1f} us" for case, spent in cost.items()), "a step of a world")
     print(motors.table(motors.uses(_policies(options), options.worlds, options.serves)))
-
-
-def study_posture(options: Options) -> None:
-    print(posture.table(posture.postures(_policies(options), options.worlds, options.serves)))
 
 
 def study_adaptation(options: Options) -> None:
@@ -154,7 +149,6 @@ STUDIES = {
     "solver": study_solver,
     "motors": study_motors,
     "predictor": study_predictor,
-    "posture": study_posture,
     "adaptation": study_adaptation,
     "senses": study_senses,
     "rounding": study_rounding,

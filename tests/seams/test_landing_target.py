@@ -25,6 +25,7 @@ def test_a_policy_trained_without_the_term_is_evaluated(tmp_path: Path) -> None:
     run, out = tmp_path / "run", tmp_path / "table"
     assert command(train, f"out={run}", "~reward.terms.predicted_landing", *SMALL) == 0
     table = ("rows=[short]", "serves=4", "num_worlds=4", "engine.threads=1", "progress=false", "physics_dt=0.01")
+    table += ("first_ball=[]",)
     assert command(evaluate, str(run), f"out={out}", *table) == 0
     assert json.loads((out / "evaluation.json").read_text())["rows"][0]["serves"] == 4
     assert (out / "landing_map.png").exists()
