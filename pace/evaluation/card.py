@@ -52,7 +52,8 @@ def _facts(folder: Path, versions: Mapping[str, Any]) -> str:
 
 def _evaluation(folder: Path, found: Mapping[str, Any]) -> str:
     overrides = [current_override(text) for text in found["overrides"] if not text.startswith(MACHINE)]
-    fixed = [f"{key}={found[key]}" for key in ("physics_dt", "num_worlds", "warmup_serves", "seed")]
+    fixed = [f"task={found.get('task_name', 'own')}"]  # files of before there was a choice: the policy's own
+    fixed += [f"{key}={found[key]}" for key in ("physics_dt", "num_worlds", "warmup_serves", "seed")]
     serves = f"serves={min(row['serves'] for row in found['rows'])}"
     command = " ".join(["python -m pace.evaluation", f"pretrained/{folder.name}", *fixed, serves, *overrides])
     table = markdown_table(

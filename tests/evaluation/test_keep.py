@@ -64,7 +64,7 @@ def test_the_card_says_what_it_is_and_how_to_play_its_table(tmp_path: Path) -> N
     assert "| last command | `python -m pace.rl.train experiment=generalist` |" in text
     assert "| versions | torch 2.13.0 |" in text
     assert "\nIt limps.\n" in text
-    command = "physics_dt=0.002 num_worlds=256 warmup_serves=2 seed=1 serves=5120 sensing=paper"
+    command = "task=own physics_dt=0.002 num_worlds=256 warmup_serves=2 seed=1 serves=5120 sensing=paper"
     assert f"`python -m pace.evaluation pretrained/mine {command}`" in text
     assert "| mid-long | 5,120 | 99.5 (99.1 to 99.7) | 97.1 (96.5 to 97.6) | 0.4 |" in text
     assert "Robustness sweep" not in text
