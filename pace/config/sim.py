@@ -204,14 +204,21 @@ class RandomizationConfig:
     backlash: Range = field(default_factory=lambda: [0.0, 0.0])  # rad, play of every joint's gear
     paddle_tilt: Range = field(default_factory=lambda: [0.0, 0.0])  # rad, of the face, in a random direction
     paddle_shift: Range = field(default_factory=lambda: [0.0, 0.0])  # m, of its centre, in a random direction
+    speed_scale: Range = field(default_factory=lambda: [1.0, 1.0])  # of max_speed; of no effect without stall_ratio
+    ankle_effort_scale: Range = field(default_factory=lambda: [1.0, 1.0])  # times effort_scale, of the group ankles
+    joint_friction: Range = field(default_factory=lambda: [0.0, 0.0])  # N m, dry, added in every joint
+    joint_damping: Range = field(default_factory=lambda: [0.0, 0.0])  # N m s/rad, added in every joint
 
     def __post_init__(self) -> None:
         for f in fields(self):
             if f.name != "name":
                 check_range(f"randomization.{f.name}", getattr(self, f.name))
-        require(self.effort_scale[0] > 0, "randomization.effort_scale must be positive")
         for name in ("actuator_delay", "backlash", "paddle_tilt", "paddle_shift"):
             check_range(f"randomization.{name}", getattr(self, name), lowest=0.0)
+        for name in ("effort_scale", "speed_scale", "ankle_effort_scale"):
+            require(getattr(self, name)[0] > 0, f"randomization.{name} must be positive")
+        for name in ("joint_friction", "joint_damping"):
+            require(getattr(self, name)[0] >= 0, f"randomization.{name} must not be negative")
 
 
 @dataclass

@@ -32,6 +32,9 @@ NEW_BALL_SAMPLES = (
     "paddle_drilling_loss",
 )
 
+#: Parameters of the robot that are sampled since format 4, and the value that changes nothing.
+NEW_ROBOT_SAMPLES = {"speed_scale": 1.0, "ankle_effort_scale": 1.0, "joint_friction": 0.0, "joint_damping": 0.0}
+
 Saved = dict[str, Any]
 Upgrade = tuple[int, Callable[[Saved], None]]
 
@@ -147,6 +150,14 @@ def describe_the_frames(state: Saved) -> None:
         env["env.predictor_valid"] = env["game.target.something_to_hit"] & env["track.something_to_hit"]
 
 
+def add_what_motors_and_joints_sample(state: Saved) -> None:
+    """A world's samples of ``engine`` that did not exist."""
+    for env in _environments(state):
+        rows = env["worlds.drawn.engine.effort_scale"]
+        for name, value in NEW_ROBOT_SAMPLES.items():
+            env.setdefault(f"worlds.drawn.engine.{name}", rows.new_full(rows.shape, value))
+
+
 def name_the_papers_robot(config: Saved) -> None:
     """``t1`` was what ``t1_paper`` is now, in the robot and in the stages of the curriculum."""
     robot = _entry(config, "robot")
@@ -186,6 +197,7 @@ STATE_UPGRADES: list[Upgrade] = [
     (3, add_the_pauses),
     (3, describe_the_frames),
     (4, sample_play_and_mount),
+    (4, add_what_motors_and_joints_sample),
 ]
 
 

@@ -32,6 +32,8 @@ SAMPLED_ENGINE_PARAMS = (
     "armature_scale",
     "effort_scale",
 )
+#: Likewise, sampled after all others, so that these of a seed are the same as before they existed.
+LATER_ENGINE_PARAMS = ("speed_scale", "ankle_effort_scale", "joint_friction", "joint_damping")
 #: Ball parameter -> (range, whether the sample scales the nominal value or is added to it).
 SAMPLED_BALL_PARAMS = {
     "mass": ("ball_mass_scale", True),
@@ -158,6 +160,8 @@ class Randomizer(Stateful):
             low, high = (end * nominal if scales else end + nominal for end in ends)
             limits = BALL_LIMITS.get(name, (0.0, float("inf")))
             columns.append(Column(getattr(self._ball_params, name), low, high, *limits))
+        for name in LATER_ENGINE_PARAMS:
+            columns.append(Column(getattr(self._engine_params, name), *getattr(self.config, name)))
         columns.append(Column(self.backlash, *self.config.backlash))
         return columns + columns_of(self.paddle_error, self._mount_ranges())
 
@@ -184,7 +188,7 @@ class Randomizer(Stateful):
 
     def state_tensors(self) -> dict[str, Tensor]:
         """All samples, for an exact resume."""
-        engine = with_prefix("engine", tensors_named(self._engine_params, SAMPLED_ENGINE_PARAMS))
+        engine = with_prefix("engine", tensors_named(self._engine_params, SAMPLED_ENGINE_PARAMS + LATER_ENGINE_PARAMS))
         ball = with_prefix("ball", tensors_named(self._ball_params, tuple(SAMPLED_BALL_PARAMS)))
         motors = {"actuator_delay": self.actuator_delay, "backlash": self.backlash}
         return engine | ball | motors | {"until_push": self._until_push, "paddle_error": self.paddle_error}

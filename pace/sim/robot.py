@@ -96,6 +96,9 @@ def build_model(robot: RobotConfig, engine: EngineConfig, table: TableConfig, vi
     """
     spec = read_scene(model_path(robot))
     _set_motors(spec, robot)
+    for group, names in RobotSpec.of(robot).groups.items():
+        joint = [int(mujoco.mjtObj.mjOBJ_JOINT)] * len(names)
+        spec.add_tuple(name=group, objtype=joint, objname=list(names), objprm=[0.0] * len(names))
     if robot.self_collision:
         _add_pairs(spec, robot.self_collision)
         _count_the_world_alone(spec)

@@ -11,6 +11,7 @@ from functools import lru_cache
 from pathlib import Path
 
 import mujoco
+import numpy as np
 
 from pace.config.base import ConfigError
 from pace.config.sim import RobotConfig
@@ -68,6 +69,19 @@ class RobotSpec:
             head=robot.head_site,
             groups={name: _matching(found.joints, parts) for name, parts in robot.groups.items()},
         )
+
+
+def joints_of(model: mujoco.MjModel, group: str) -> list[int]:
+    """The joints of a group of ``robot.groups``, by their places in actions and targets; none if it has no such group.
+
+    The model of :func:`pace.sim.robot.build_model` keeps each group as a tuple of its joints.
+    """
+    place = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_TUPLE, group)
+    if place < 0:
+        return []
+    first, size = model.tuple_adr[place], model.tuple_size[place]
+    joints = model.tuple_objid[first : first + size]
+    return [int(index) for index in np.flatnonzero(np.isin(model.actuator_trnid[:, 0], joints))]
 
 
 @dataclass(frozen=True)

@@ -112,12 +112,13 @@ def test_upgrades_run_in_order_and_only_where_they_are_due(monkeypatch: pytest.M
 
 
 def old_env(worlds: int = 3) -> dict[str, torch.Tensor]:
-    """The tensors of an environment of format 2 that the upgrades to format 3 read."""
+    """The tensors of an environment of format 2 that the upgrades read."""
     flags = torch.arange(worlds) % 2 == 0
     return {
         "sensing._line": torch.rand(worlds, 2, 8),
         "sensing._delay": torch.full((worlds,), 0.5),
         "worlds.drawn.ball.mass": torch.full((worlds,), 0.0027),
+        "worlds.drawn.engine.effort_scale": torch.full((worlds,), 0.97),
         "worlds.position": torch.rand(worlds, 3),
         "game.ends.over": flags,
         "game.ends.outcome": flags.int(),
@@ -137,6 +138,8 @@ def test_a_state_of_format_2_gets_what_the_true_world_keeps() -> None:
     assert env["sensing.ball_new"].all()
     assert env["env.predictor_valid"].tolist() == [True, False, True]
     assert env["worlds.drawn.ball.paddle_tangential_restitution"].tolist() == [0.0] * 3
+    assert env["worlds.drawn.engine.speed_scale"].tolist() == [1.0] * 3
+    assert env["worlds.drawn.engine.joint_friction"].tolist() == [0.0] * 3
     assert env["worlds.in_view"].all()
     assert not env["game.pause.waiting"].any()
     assert env["serves.sampled"].shape == (3, 9)
