@@ -16,8 +16,9 @@ from pace.config.predictor import PredictorPriors
 from pace.config.renamed import change_stages, with_current_names
 from pace.config.task import SPINS
 
-#: Format that this version writes. 1: version 0.1.0 up to commit 43400ac; 2: up to 72b96bb, before the true world.
-FORMAT = 3
+#: Format that this version writes. 1: version 0.1.0 up to commit 43400ac; 2: up to 72b96bb, before the true world;
+#: 3: up to 8d3869a, before the robot of the maker's newest numbers.
+FORMAT = 4
 
 #: Landing target of a saved configuration without one (released configuration).
 LANDING_TARGET = (1.15, 0.0)  # m
@@ -30,6 +31,12 @@ NEW_BALL_SAMPLES = (
     "paddle_tangential_restitution",
     "paddle_drilling_loss",
 )
+
+#: Hands of the robots of this package, by their MJCF; new keys of the robot in format 4.
+HANDS: dict[str, dict[str, Any]] = {
+    "t1_paddle.xml": {"paddle_hand": [], "free_hand": "left_hand_link"},
+    "t1_29dof_paddle.xml": {"paddle_hand": ["right_hand_link"], "free_hand": "AL4"},
+}
 
 Saved = dict[str, Any]
 Upgrade = tuple[int, Callable[[Saved], None]]
@@ -138,6 +145,23 @@ def describe_the_frames(state: Saved) -> None:
         env["env.predictor_valid"] = env["game.target.something_to_hit"] & env["track.something_to_hit"]
 
 
+def name_the_hands(config: Saved) -> None:
+    """The rule that the free hand must not touch the table holds for policies that were trained before it."""
+    robot = _entry(config, "robot")
+    for key, hand in HANDS.get(robot.get("model", ""), {}).items():
+        robot.setdefault(key, hand)
+
+
+def add_the_body(state: Saved) -> None:
+    """The robot's body was no surface, and two outcomes were not counted: they are the last of the statistics."""
+    for env in _environments(state):
+        counts, sums = env["worlds.event.edge"], env["statistics.sums"]
+        env.setdefault("worlds.event.body", counts.new_zeros(counts.shape))
+        env.setdefault("worlds.event.body_time", env["worlds.event.edge_time"].new_full(counts.shape, float("inf")))
+        env["statistics.sums"] = sums.new_zeros(len(sums) + 2)
+        env["statistics.sums"][:-2] = sums
+
+
 def _environments(state: Saved) -> Iterator[Saved]:
     """The saved tensors of each process's environment; none in a state without processes."""
     for process in state.get("processes") or ():
@@ -160,6 +184,7 @@ CONFIG_UPGRADES: list[Upgrade] = [
     (2, store_the_predictors_priors),
     (3, name_the_first_reading),
     (3, split_the_spin),
+    (4, name_the_hands),
 ]
 #: (format that it makes, function of the training state: ``ppo``, ``regression`` and ``processes``, each of them with
 #: ``env`` and ``random``). Tensors are in their places.
@@ -167,6 +192,7 @@ STATE_UPGRADES: list[Upgrade] = [
     (3, add_what_rubber_and_air_sample),
     (3, add_the_pauses),
     (3, describe_the_frames),
+    (4, add_the_body),
 ]
 
 

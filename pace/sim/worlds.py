@@ -18,6 +18,7 @@ from pace.config.sim import SimConfig
 from pace.devices import resolve_device
 from pace.sim.ball.ball import BallParams, BallSim
 from pace.sim.ball.state import BallArrays, BallState
+from pace.sim.bodies import Bodies
 from pace.sim.engine.factory import make_engine
 from pace.sim.kinematics import Kinematics
 from pace.sim.randomization import Randomizer
@@ -115,6 +116,8 @@ class Worlds(Stateful):
         self.model = model or build_model(config.robot, config.engine, config.ball.table)
         self.engine = make_engine(self.model, config.engine, num_worlds, self.device, config.substeps)
         self.kinematics = Kinematics(self.model, self.spec.tips, num_worlds, config.substeps, self.device)
+        hand, steps = config.robot.paddle_hand, config.substeps
+        self.bodies = Bodies(self.model, hand, num_worlds, steps, self.control_dt, self.device)
         self.ball = BallSim(
             num_worlds,
             self.device,
@@ -124,6 +127,7 @@ class Worlds(Stateful):
             config.substeps,
             config.engine.ball_dt,
             config.ball.air,
+            self.bodies.surface,
         )
         self.randomizer = Randomizer(
             config.randomization,
@@ -160,6 +164,7 @@ class Worlds(Stateful):
         self._stand = MaskedLaunch(_stand, n, device, qpos=qpos, **held)
         delay, share = self.randomizer.actuator_delay, self._new_share.squeeze(-1)
         times = {"delay": delay, "physics_dt": self.config.engine.physics_dt}
+        self._pose_bodies = self.bodies.poser(qpos, self.kinematics.paddle_path, self.ball)
         self._update_delay = Launch(_spread_delay, n, device, new_share=share, **times)
         self._serve = Bound(self._record_serve, position=(n, 3), velocity=(n, 3), spin=(n, 3))
 
@@ -198,7 +203,7 @@ class Worlds(Stateful):
 
         Order: targets pass the actuator delay (a physics step in which the new target arrives gets the mean of both),
         pushes and the ball's last impulse on the paddle act, the robot moves, then the ball flies the same interval
-        along the paddle's path.
+        along the paths of paddle and body. Its impulse on the body does not act back.
         """
         change = (targets - self._previous_targets).unsqueeze(1)
         torch.mul(self._new_share, change, out=self._targets)
@@ -210,6 +215,7 @@ class Worlds(Stateful):
             self._react()
         self.engine.advance(self._targets, self._applied)
         self._observe()
+        self._pose_bodies()
         self.ball.fly(self.kinematics.paddle_path)
 
     def _react(self) -> None:
