@@ -51,6 +51,9 @@ class RobotConfig:
     # of a body those with floor and table alone
     self_collision: list[list[str]] = field(default_factory=list)
     reset_limits: dict[str, Range] = field(default_factory=dict)  # rad, within which a joint starts, besides its range
+    # bodies or geoms of the hand that holds the paddle, below the wrist: the ball may touch them as it may the paddle
+    paddle_hand: list[str] = field(default_factory=list)
+    free_hand: str = ""  # body of the hand without the paddle, which must not touch the playing surface; "": none
 
     def __post_init__(self) -> None:
         for pair in self.self_collision:
@@ -68,7 +71,8 @@ class RobotConfig:
 
 @dataclass
 class TableConfig:
-    """Table, net, floor and paddle for the ball's collisions; world frame, origin under the table's centre."""
+    """Table, net, floor, paddle and the robot's body for the ball's collisions; world frame, origin under the table's
+    centre. The numbers of body and push apply to policies saved before they existed too: they are rules of the game."""
 
     length: float  # m, along x
     width: float  # m, along y
@@ -82,6 +86,14 @@ class TableConfig:
     floor_friction: float
     net_restitution: float
     net_friction: float
+    body_restitution: float = 0.8  # of the robot's body, arms and head
+    body_friction: float = 0.25
+    push_force: float = 100.0  # N, mean over a control step: a robot that pushes harder moves the table
+
+    def __post_init__(self) -> None:
+        require(0 <= self.body_restitution <= 1, "ball.table.body_restitution must lie in [0, 1]")
+        require(self.body_friction >= 0, "ball.table.body_friction must not be negative")
+        require(self.push_force > 0, "ball.table.push_force must be positive")
 
 
 @dataclass

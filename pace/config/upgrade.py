@@ -35,6 +35,12 @@ NEW_BALL_SAMPLES = (
 #: Parameters of the robot that are sampled since format 4, and the value that changes nothing.
 NEW_ROBOT_SAMPLES = {"speed_scale": 1.0, "ankle_effort_scale": 1.0, "joint_friction": 0.0, "joint_damping": 0.0}
 
+#: Hands of the robots of this package, by their MJCF; new keys of the robot in format 4.
+HANDS: dict[str, dict[str, Any]] = {
+    "t1_paddle.xml": {"paddle_hand": [], "free_hand": "left_hand_link"},
+    "t1_29dof_paddle.xml": {"paddle_hand": ["right_hand_link"], "free_hand": "AL4"},
+}
+
 Saved = dict[str, Any]
 Upgrade = tuple[int, Callable[[Saved], None]]
 
@@ -166,6 +172,23 @@ def name_the_papers_robot(config: Saved) -> None:
     change_stages(config, lambda text: ["robot=t1_paper" if text == "robot=t1" else text])
 
 
+def name_the_hands(config: Saved) -> None:
+    """The rule that the free hand must not touch the table holds for policies that were trained before it."""
+    robot = _entry(config, "robot")
+    for key, hand in HANDS.get(robot.get("model", ""), {}).items():
+        robot.setdefault(key, hand)
+
+
+def add_the_body(state: Saved) -> None:
+    """The robot's body was no surface, and two outcomes were not counted: they are the last of the statistics."""
+    for env in _environments(state):
+        counts, sums = env["worlds.event.edge"], env["statistics.sums"]
+        env.setdefault("worlds.event.body", counts.new_zeros(counts.shape))
+        env.setdefault("worlds.event.body_time", env["worlds.event.edge_time"].new_full(counts.shape, float("inf")))
+        env["statistics.sums"] = sums.new_zeros(len(sums) + 2)
+        env["statistics.sums"][:-2] = sums
+
+
 def _environments(state: Saved) -> Iterator[Saved]:
     """The saved tensors of each process's environment; none in a state without processes."""
     for process in state.get("processes") or ():
@@ -189,6 +212,7 @@ CONFIG_UPGRADES: list[Upgrade] = [
     (3, name_the_first_reading),
     (3, split_the_spin),
     (4, name_the_papers_robot),
+    (4, name_the_hands),
 ]
 #: (format that it makes, function of the training state: ``ppo``, ``regression`` and ``processes``, each of them with
 #: ``env`` and ``random``). Tensors are in their places.
@@ -198,6 +222,7 @@ STATE_UPGRADES: list[Upgrade] = [
     (3, describe_the_frames),
     (4, sample_play_and_mount),
     (4, add_what_motors_and_joints_sample),
+    (4, add_the_body),
 ]
 
 

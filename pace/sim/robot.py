@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 
 from pace.config.base import ConfigError
 from pace.config.sim import EngineConfig, JointGroup, RobotConfig, TableConfig
-from pace.sim.robot_spec import PADDLE, TOUCH, RobotSpec, model_path, read_scene
+from pace.sim.robot_spec import PADDLE, TABLE_FORCES, TOUCH, RobotSpec, model_path, read_scene
 
 #: Name of the keyframe: nominal pose, soles on the floor.
 NOMINAL_KEY = "nominal"
 #: Group of the geoms that are only for display.
 VISUAL_GROUP = 2
+#: Of a contact sensor: the sum of all contacts that match.
+NET_FORCE = 3
 #: The only input of a motor: its target position.
 POSITION = int(mujoco.mjtCtrlInput.mjINPUT_POS)
 
@@ -91,8 +93,8 @@ def build_model(robot: RobotConfig, engine: EngineConfig, table: TableConfig, vi
         visual: keep the geoms that are only for display. The dynamics are the same with and without them;
             physics leaves them out because each costs time in every step.
 
-    Errors: :class:`ConfigError` for gains or a pose that do not fit the robot's joints, and for pairs of
-    ``robot.self_collision`` that the MJCF lacks a geom for, or lists already.
+    Errors: :class:`ConfigError` for gains or a pose that do not fit the robot's joints, for a free hand that the robot
+    does not have, and for pairs of ``robot.self_collision`` that the MJCF lacks a geom for, or lists already.
     """
     spec = read_scene(model_path(robot))
     _set_motors(spec, robot)
@@ -103,6 +105,7 @@ def build_model(robot: RobotConfig, engine: EngineConfig, table: TableConfig, vi
         _add_pairs(spec, robot.self_collision)
         _count_the_world_alone(spec)
     _fit_table(spec, table)
+    _sense_table(spec, robot.free_hand)
     spec.option.timestep = engine.physics_dt
     spec.option.iterations = engine.solver_iterations
     spec.option.ls_iterations = engine.line_search_iterations
@@ -196,6 +199,19 @@ def _fit_table(spec: mujoco.MjSpec, table: TableConfig) -> None:
         if geom is not None:  # for the eye only; a robot may do without
             geom.size[:2] = (table.paddle_radius - 0.0005, 0.001)
             geom.pos[0] = side * (table.paddle_half_thickness - 0.0007)
+
+
+def _sense_table(spec: mujoco.MjSpec, free_hand: str) -> None:
+    """Append the sensors of :data:`TABLE_FORCES`: net contact force on the table, world frame."""
+    if free_hand and spec.body(free_hand) is None:
+        raise ConfigError(f"robot.free_hand: the robot has no body {free_hand}")
+    reported = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE)
+    for name in TABLE_FORCES if free_hand else TABLE_FORCES[:1]:
+        sensor = spec.add_sensor(name=name, type=mujoco.mjtSensor.mjSENS_CONTACT)
+        sensor.objtype, sensor.objname = mujoco.mjtObj.mjOBJ_GEOM, "table"
+        if name != TABLE_FORCES[0]:  # the hand's body and all that it carries
+            sensor.reftype, sensor.refname = mujoco.mjtObj.mjOBJ_XBODY, free_hand
+        sensor.intprm[:3] = (reported, NET_FORCE, 1)
 
 
 def _standing(model: mujoco.MjModel, pose: NDArray[np.float64], soles: Sequence[str]) -> NDArray[np.float64]:

@@ -19,6 +19,7 @@ from pace.devices import resolve_device
 from pace.sim.actuation import Actuation
 from pace.sim.ball.ball import BallParams, BallSim
 from pace.sim.ball.state import BallArrays, BallState
+from pace.sim.bodies import Bodies
 from pace.sim.engine.factory import make_engine
 from pace.sim.kinematics import Kinematics
 from pace.sim.randomization import Randomizer
@@ -100,6 +101,8 @@ class Worlds(Stateful):
         self.model = model or build_model(config.robot, config.engine, config.ball.table)
         self.engine = make_engine(self.model, config.engine, num_worlds, self.device, config.substeps)
         self.kinematics = Kinematics(self.model, self.spec.tips, num_worlds, config.substeps, self.device)
+        hand, steps = config.robot.paddle_hand, config.substeps
+        self.bodies = Bodies(self.model, hand, num_worlds, steps, self.control_dt, self.device)
         self.ball = BallSim(
             num_worlds,
             self.device,
@@ -109,6 +112,7 @@ class Worlds(Stateful):
             config.substeps,
             config.engine.ball_dt,
             config.ball.air,
+            self.bodies.surface,
         )
         self.randomizer = Randomizer(
             config.randomization,
@@ -147,6 +151,7 @@ class Worlds(Stateful):
         path = {"qpos": qpos, "qvel": self.engine.qvel_path, "last": self.config.substeps}
         self._derive = MaskedLaunch(_derive, n, device, robot=self.robot, inverse_dt=1.0 / self.control_dt, **path)
         self._forget_impulse = MaskedLaunch(_forget_impulse, n, device, impulse=self.ball.events.paddle_impulse)
+        self._pose_bodies = self.bodies.poser(qpos, self.kinematics.paddle_path, self.ball)
         self._serve = Bound(self._record_serve, position=(n, 3), velocity=(n, 3), spin=(n, 3))
 
     def _record_serve(self, position: Tensor, velocity: Tensor, spin: Tensor) -> MaskedLaunch:
@@ -184,7 +189,7 @@ class Worlds(Stateful):
 
         Order: targets pass the actuator delay and the gears' play (:class:`pace.sim.actuation.Actuation`), pushes and
         the ball's last impulse on the paddle act, the robot moves, then the ball flies the same interval along the
-        paddle's path.
+        paths of paddle and body. Its impulse on the body does not act back.
         """
         delayed = self.actuation(targets)
         if self.randomizer.pushes_enabled:
@@ -193,6 +198,7 @@ class Worlds(Stateful):
             self._react()
         self.engine.advance(delayed, self._applied)
         self._observe()
+        self._pose_bodies()
         self.ball.fly(self.kinematics.paddle_path)
 
     def _react(self) -> None:

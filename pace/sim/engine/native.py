@@ -50,6 +50,8 @@ class NativeEngine(StateTensors):
         self._record = {name: np.zeros((num_worlds, substeps, width)) for name, width in widths.items()}
         self._sensordata = torch.from_numpy(self._record["sensordata"])[:, -1]
         self._actuator_force = torch.from_numpy(self._record["actuator_force"])[:, -1]
+        self._on_table = self._record["sensordata"][..., model.nsensordata - 3 * self.table_force.shape[2] :]
+        self._table_force = self.table_force.numpy().reshape(self._on_table.shape)
         # NumPy copies: torch's would wake torch's threads beside the pool's, which costs milliseconds on busy cores
         self._paths = {"qpos": self.qpos_path.numpy(), "qvel": self.qvel_path.numpy()}
         self._qpos[:] = self._paths["qpos"][:, 0]
@@ -62,6 +64,7 @@ class NativeEngine(StateTensors):
         self._batch.rollout(self.substeps, self._control, _CONTROL, tuple(self._record), out=self._record)
         for name, path in self._paths.items():
             path[:, 1:] = self._record[name]
+        self._table_force[:] = self._on_table
         self._read_sensors(self._sensordata, self._actuator_force)
 
     def _solver_state(self) -> dict[str, Tensor]:
