@@ -53,8 +53,8 @@ class RobotEngine(Protocol):
         foot_force: (N, 2, 3) N, world frame: net contact force on the left and right foot in the last physics step.
         body_contact: (N, B): 1 if that body of ``RobotSpec.contacts`` touched anything in the last physics step.
         joint_torque: (N, J) N m: of the motors in the last physics step.
-        table_force: (N, S, T, 3) N, world frame: net contact force between robot and table in each of the S physics
-            steps, towards the robot; of the whole robot and, if ``robot.free_hand`` names one (T = 2), of its free hand.
+        table_force: (N, S, T, 3) N, world frame: net contact force of the table on the robot in each of the S physics
+            steps; on the whole robot and, if ``robot.free_hand`` names one (T = 2), on its free hand.
         params: physical parameters of each world.
     """
 
@@ -142,7 +142,9 @@ class StateTensors(EngineState, Stateful):
         sizes = {"feet": FEET, "bodies": model.nsensordata - 3 * (FEET + touches), "joints": model.nu}
         sizes |= {"instants": substeps + 1, "nq": model.nq, "nv": model.nv}
         super().__init__(**vars(allocate(EngineState, num_worlds, device, **sizes)))
-        self.table_force = torch.zeros(num_worlds, substeps, touches, 3, device=device)  # of each step: no part of the state
+        self.table_force = torch.zeros(
+            num_worlds, substeps, touches, 3, device=device
+        )  # of each step: no part of the state
         self.qpos_path.copy_(torch.as_tensor(model.key_qpos[0], dtype=torch.float32))
         starts = {"qpos": (num_worlds, model.nq), "qvel": (num_worlds, model.nv)}
         self._reset = Bound(self._record_reset, **starts)
