@@ -145,7 +145,7 @@ def _pose(
     wanted: wp.array2d[wp.bool],
     body: RobotBody,
 ):
-    """Find the shapes that the ball of a world may meet in the coming flight; pose their links and bound their speed."""
+    """Find the shapes that a world's ball may meet in the coming flight; pose their links and bound their speed."""
     world = wp.tid()
     last = qpos_path.shape[1] - 1
     way = _way(ball, radius[world], paddle_path[world], paddle_size, path_dt * float(last), world)

@@ -202,7 +202,7 @@ def _fit_table(spec: mujoco.MjSpec, table: TableConfig) -> None:
 
 
 def _sense_table(spec: mujoco.MjSpec, free_hand: str) -> None:
-    """Append the sensors of :data:`TABLE_FORCES`: net contact force on the table, world frame."""
+    """Append the sensors of :data:`TABLE_FORCES`: net contact forces of the table, world frame."""
     if free_hand and spec.body(free_hand) is None:
         raise ConfigError(f"robot.free_hand: the robot has no body {free_hand}")
     reported = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE)

@@ -20,8 +20,8 @@ ASSETS = Path(__file__).parent / "assets"
 #: Suffix of the sensors that count the contacts of a geom.
 TOUCH = "_touch"
 FEET = 2  # left and right
-#: Names of the sensors that :func:`pace.sim.robot.build_model` appends: force on the table (N, world frame) of the whole
-#: robot, and of its free hand if it has one.
+#: Names of the sensors that :func:`pace.sim.robot.build_model` appends: force of the table (N, world frame) on the
+#: whole robot, and on its free hand if it has one.
 TABLE_FORCES = ("table_force", "free_hand_force")
 #: Groups of joints that reward terms sum over (``pace.task.state_kernels``); a robot may lack some.
 GROUPS = ("ankles", "hip_waist_left_arm", "left_shoulder_roll", "right_arm")

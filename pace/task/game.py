@@ -53,7 +53,7 @@ class Game(GameState, Stateful):
         config: the task.
         ball: the balls that are played; their tensors are read by each call.
         base_position: (N, 3) m, of the robots; read by :meth:`close`.
-        table_force: (N, S, T, 3) N, between robots and table (:class:`pace.sim.engine.base.RobotEngine`); ``None``:
+        table_force: (N, S, T, 3) N, of the tables on the robots (:class:`pace.sim.engine.base.RobotEngine`); ``None``:
             nobody touches it.
     """
 
@@ -71,7 +71,14 @@ class Game(GameState, Stateful):
         if table_force is None:
             table_force = torch.zeros(count, 1, 1, 3, device=device)
         self._judge = Launch(
-            referee.judge, count, device, game=self, events=ball.events, ball=ball, table_force=table_force, rules=self.rules
+            referee.judge,
+            count,
+            device,
+            game=self,
+            events=ball.events,
+            ball=ball,
+            table_force=table_force,
+            rules=self.rules,
         )
         self._record(config.serve, ball, base_position)
 

@@ -90,9 +90,7 @@ def _missed_time(events: EventArrays, before: int, touch: float, dead: float, wo
 
 
 @wp.kernel
-def judge(
-    game: GameArrays, events: EventArrays, ball: BallArrays, table_force: wp.array3d[wp.vec3], rules: Rules
-):
+def judge(game: GameArrays, events: EventArrays, ball: BallArrays, table_force: wp.array3d[wp.vec3], rules: Rules):
     """The referee: consume the events of one control step in the order of their times."""
     world = wp.tid()
     was_open = game.referee.outcome[world] == Outcome.OPEN

@@ -181,8 +181,12 @@ BODY: dict[str, Any] = {"body": 0.01}
         pytest.param([BOUNCE, HIT, {"net": 0.002, "body": 0.004}], Outcome.BODY, True, id="off the net onto the body"),
         pytest.param([BOUNCE, {"floor": 0.004, "body": 0.01}], Outcome.MISS, False, id="floor before body"),
         pytest.param([BOUNCE, {"floor": 0.01, "body": 0.004}], Outcome.BODY, False, id="body before floor"),
-        pytest.param([BOUNCE, {"own_bounce": 0.004, "body": 0.01}], Outcome.MISS, False, id="second bounce before body"),
-        pytest.param([BOUNCE, {"own_bounce": 0.01, "body": 0.004}], Outcome.BODY, False, id="body before second bounce"),
+        pytest.param(
+            [BOUNCE, {"own_bounce": 0.004, "body": 0.01}], Outcome.MISS, False, id="second bounce before body"
+        ),
+        pytest.param(
+            [BOUNCE, {"own_bounce": 0.01, "body": 0.004}], Outcome.BODY, False, id="body before second bounce"
+        ),
         pytest.param([HIT, BODY], Outcome.VOLLEY, False, id="volley before"),
     ],
 )

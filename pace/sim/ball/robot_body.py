@@ -3,7 +3,7 @@
 A shape is a box with rounded edges, which is a sphere if its half sizes are zero and a capsule if two of them are, or a
 cylinder: for both the distance is a closed form. Between two instants of a control step a link's origin moves on a
 straight line and its rotation along the shortest way. That is off by a dt^2 / 8, a the acceleration and dt the time
-between the instants: within 2 mm at dt = 10 ms for a swinging forearm (``tests/sim/test_bodies.py`` measures it).
+between the instants: within 2 mm at dt = 10 ms for a swinging forearm (``tests/sim/test_bodies.py``).
 """
 
 import warp as wp
@@ -55,7 +55,7 @@ class Nearest:
 
 @wp.func
 def turning_between(start: wp.quat, end: wp.quat, duration: float) -> wp.vec3:
-    """Angular velocity (rad/s), world frame, of a rotation from ``start`` to ``end``: exact to the cube of the angle."""
+    """Angular velocity (rad/s), world frame, of a small rotation from ``start`` to ``end``: off by the angle's cube."""
     turn = end * wp.quat_inverse(start)
     return (2.0 / duration) * wp.vec3(turn[0], turn[1], turn[2])
 

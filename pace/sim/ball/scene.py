@@ -16,8 +16,9 @@ BODY = wp.constant(4)
 STATIC_SURFACES = 3
 ALL_SURFACES = 5
 
-#: A gap (m) for each surface.
-Gaps = wp.types.vector(length=ALL_SURFACES, dtype=wp.float32)
+
+class Gaps(wp.types.vector(length=ALL_SURFACES, dtype=wp.float32)):
+    """A gap (m) to each surface."""
 
 
 @wp.struct

@@ -27,8 +27,9 @@ class BallEvents:
 
     Counts are of contacts that begin; a rolling or resting ball counts once. The rims of the table's top belong to the
     top (ITTF 2.1.5); its sides and underside count as ``edge``. ``body`` is the robot's body, arms, legs and head; the
-    hand that holds the paddle, below the wrist, counts as the paddle (ITTF 2.5.7). Times are s into the control step, of the first contact
-    of that kind, infinite if there is none. The ``hit`` values belong to the first paddle hit and are zero without one.
+    hand that holds the paddle, below the wrist, counts as the paddle (ITTF 2.5.7). Times are s into the control step,
+    of the first contact of that kind, infinite if there is none. The ``hit`` values belong to the first paddle hit and
+    are zero without one.
     """
 
     own_bounce: Int

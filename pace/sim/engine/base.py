@@ -57,8 +57,8 @@ class RobotEngine(Protocol):
         foot_force: (N, 2, 3) N, world frame: net contact force on the left and right foot in the last physics step.
         body_contact: (N, B): 1 if that body of ``RobotSpec.contacts`` touched anything in the last physics step.
         joint_torque: (N, J) N m: of the motors in the last physics step.
-        table_force: (N, S, T, 3) N, world frame: net contact force between robot and table in each of the S physics
-            steps, towards the robot; of the whole robot and, if ``robot.free_hand`` names one (T = 2), of its free hand.
+        table_force: (N, S, T, 3) N, world frame: net contact force of the table on the robot in each of the S physics
+            steps; on the whole robot and, if ``robot.free_hand`` names one (T = 2), on its free hand.
         params: physical parameters of each world.
     """
 

@@ -378,15 +378,15 @@ def test_paddle_in_the_table_is_seen(fresh):
 
 
 def beside_the_table(model):
-    """Standing away from it; left forearm, held forwards, 2 mm in its top; thighs 2 mm in its end; paddle in its top."""
+    """Standing away from it; left forearm, held forwards, 2 mm in its top; thighs 2 mm in its end; paddle in it."""
     data, at = mujoco.MjData(model), standing(model)
     at[1, 7 + JOINT_NAMES.index("Left_Shoulder_Pitch")] = -1.57
     for world, name, place in ((1, "left_forearm", [-1.25, 0.2, 0.758]), (3, "paddle", [-1.3, 0.2, 0.758])):
         put_lowest(model, data, at[world], name, np.array(place))
     data.qpos[:] = at[2]
     mujoco.mj_kinematics(model, data)
-    front = data.geom("left_thigh").xpos + [model.geom("left_thigh").size[0], 0.0, 0.0]
-    at[2, :3] += torch.tensor([-1.368, 0.2, 0.745] - front, dtype=torch.float32)
+    front = np.array([-1.368 - model.geom("left_thigh").size[0], 0.2, 0.745])
+    at[2, :3] += torch.tensor(front - data.geom("left_thigh").xpos, dtype=torch.float32)
     return at
 
 
@@ -396,7 +396,8 @@ def put_lowest(model, data, qpos, name, place):
     mujoco.mj_kinematics(model, data)
     steep, size = abs(data.geom(name).xmat[8]), model.geom(name).size
     depth = size[1] * steep + size[0] * (np.sqrt(1 - steep**2) if name == "paddle" else 1.0)
-    qpos[:3] += torch.tensor(place + [0.0, 0.0, depth] - data.geom(name).xpos, dtype=torch.float32)
+    lift = np.array([0.0, 0.0, depth])
+    qpos[:3] += torch.tensor(place + lift - data.geom(name).xpos, dtype=torch.float32)
 
 
 def forces_on_the_robot(model, data):
