@@ -96,11 +96,14 @@ def build_model(robot: RobotConfig, engine: EngineConfig, table: TableConfig, vi
     Errors: :class:`ConfigError` for gains or a pose that do not fit the robot's joints, for a free hand that the robot
     does not have, and for pairs of ``robot.self_collision`` that the MJCF lacks a geom for, or lists already.
     """
+    return compile_scene(describe_scene(robot, engine, table, visual), robot)
+
+
+def describe_scene(robot: RobotConfig, engine: EngineConfig, table: TableConfig, visual: bool = False) -> mujoco.MjSpec:
+    """What :func:`build_model` compiles, with the same arguments and errors; parts can still be added."""
     spec = read_scene(model_path(robot))
     _set_motors(spec, robot)
-    for group, names in RobotSpec.of(robot).groups.items():
-        joint = [int(mujoco.mjtObj.mjOBJ_JOINT)] * len(names)
-        spec.add_tuple(name=group, objtype=joint, objname=list(names), objprm=[0.0] * len(names))
+    _add_groups(spec, robot)
     if robot.self_collision:
         _add_pairs(spec, robot.self_collision)
         _count_the_world_alone(spec)
@@ -113,10 +116,25 @@ def build_model(robot: RobotConfig, engine: EngineConfig, table: TableConfig, vi
     if not visual:
         for geom in [g for g in spec.geoms if g.group == VISUAL_GROUP]:
             spec.delete(geom)
+    return spec
+
+
+def compile_scene(spec: mujoco.MjSpec, robot: RobotConfig) -> mujoco.MjModel:
+    """The model of ``spec``, with the nominal keyframe of ``robot``.
+
+    Errors: :class:`ConfigError` for a pose that does not fit the robot's joints.
+    """
     spec.add_key(name=NOMINAL_KEY)
     model = spec.compile()
     model.key(NOMINAL_KEY).qpos[:] = _standing(model, nominal_pose(robot), robot.foot_sites)
     return model
+
+
+def _add_groups(spec: mujoco.MjSpec, robot: RobotConfig) -> None:
+    """Keep the groups of joints as tuples of the model, for :func:`pace.sim.robot_spec.joints_of`."""
+    for group, names in RobotSpec.of(robot).groups.items():
+        joint = [int(mujoco.mjtObj.mjOBJ_JOINT)] * len(names)
+        spec.add_tuple(name=group, objtype=joint, objname=list(names), objprm=[0.0] * len(names))
 
 
 def _set_motors(spec: mujoco.MjSpec, robot: RobotConfig) -> None:
