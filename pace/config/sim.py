@@ -11,13 +11,21 @@ from pace.config.base import Range, check_range, require
 
 @dataclass
 class JointGroup:
-    """Gains and limits of the joints whose name contains one of ``match``."""
+    """Gains, limits, inertia and friction of the joints whose name contains one of ``match``."""
 
     match: list[str]
     kp: float  # N m / rad
     kd: float  # N m s / rad
     effort: float  # N m
     max_speed: float = 0.0  # rad/s, at which the motor has no torque; needed if robot.stall_ratio is on
+    armature: float | None = None  # kg m^2; None: robot.armature
+    friction: float = 0.0  # N m, dry
+
+    def __post_init__(self) -> None:
+        for name in ("armature", "friction"):
+            value = getattr(self, name)
+            known = value is None or 0 <= value < math.inf
+            require(known, f"robot.joint_groups {self.match}: {name} must be finite and not negative, got {value}")
 
 
 @dataclass
@@ -34,13 +42,21 @@ class RobotConfig:
     control_dt: float  # s
     action_scale: float  # rad per unit of action
     action_clip: float  # largest |action|
-    armature: float  # kg m^2
+    armature: float  # kg m^2, of joints whose group has none
     base_height: float  # m, base above the floor at reset
     joint_groups: list[JointGroup]  # the first match of a joint counts
     nominal_pose: dict[str, float]  # rad; joints not named are at 0
     stall_ratio: float = 0.0  # stall torque over effort; 0: full effort at any speed (earlier policies)
+    # pairs of geoms that touch each other, besides those that the MJCF lists; a robot that has some counts as contacts
+    # of a body those with floor and table alone
+    self_collision: list[list[str]] = field(default_factory=list)
+    reset_limits: dict[str, Range] = field(default_factory=dict)  # rad, within which a joint starts, besides its range
 
     def __post_init__(self) -> None:
+        for pair in self.self_collision:
+            require(len(set(pair)) == len(pair) == 2, f"robot.self_collision needs pairs of two geoms, got {pair}")
+        for joint, limits in self.reset_limits.items():
+            check_range(f"robot.reset_limits.{joint}", limits)
         require(self.control_dt > 0, "robot.control_dt must be positive")
         require(len(self.foot_sites) == 2, f"robot.foot_sites must name a left and a right sole, got {self.foot_sites}")
         known = self.stall_ratio == 0 or 1 <= self.stall_ratio < math.inf
@@ -185,12 +201,17 @@ class RandomizationConfig:
     table_tangential_restitution: Range = field(default_factory=lambda: [0.0, 0.0])  # added
     paddle_tangential_restitution: Range = field(default_factory=lambda: [0.0, 0.0])  # added
     paddle_drilling_loss: Range = field(default_factory=lambda: [0.0, 0.0])  # added
+    backlash: Range = field(default_factory=lambda: [0.0, 0.0])  # rad, play of every joint's gear
+    paddle_tilt: Range = field(default_factory=lambda: [0.0, 0.0])  # rad, of the face, in a random direction
+    paddle_shift: Range = field(default_factory=lambda: [0.0, 0.0])  # m, of its centre, in a random direction
 
     def __post_init__(self) -> None:
         for f in fields(self):
             if f.name != "name":
                 check_range(f"randomization.{f.name}", getattr(self, f.name))
         require(self.effort_scale[0] > 0, "randomization.effort_scale must be positive")
+        for name in ("actuator_delay", "backlash", "paddle_tilt", "paddle_shift"):
+            check_range(f"randomization.{name}", getattr(self, name), lowest=0.0)
 
 
 @dataclass
@@ -239,6 +260,8 @@ class SensingConfig:
     moved: float = 0.03
     # m/s; a ball sensed farther from its last position than this allows is another ball (smashes: below 20 m/s)
     fastest_ball: float = 25.0
+    # s; a ball without a frame is extrapolated for so long, and one that is seen again after it counts as another
+    longest_gap: float = 0.1
     mocap: MocapConfig = field(default_factory=MocapConfig)
 
     def __post_init__(self) -> None:
@@ -246,6 +269,7 @@ class SensingConfig:
         check_range("sensing.noise_scale", self.noise_scale, lowest=0.0)
         require(self.moved >= 0, f"sensing.moved must not be negative, got {self.moved}")
         require(self.fastest_ball > 0, f"sensing.fastest_ball must be positive, got {self.fastest_ball}")
+        require(self.longest_gap >= 0, f"sensing.longest_gap must not be negative, got {self.longest_gap}")
 
 
 @dataclass

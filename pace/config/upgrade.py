@@ -16,8 +16,9 @@ from pace.config.predictor import PredictorPriors
 from pace.config.renamed import change_stages, with_current_names
 from pace.config.task import SPINS
 
-#: Format that this version writes. 1: version 0.1.0 up to commit 43400ac; 2: up to 72b96bb, before the true world.
-FORMAT = 3
+#: Format that this version writes. 1: version 0.1.0 up to commit 43400ac; 2: up to 72b96bb, before the true world;
+#: 3: up to 8d3869a, before gears had play and motors the maker's numbers.
+FORMAT = 4
 
 #: Landing target of a saved configuration without one (released configuration).
 LANDING_TARGET = (1.15, 0.0)  # m
@@ -122,6 +123,14 @@ def add_the_pauses(state: Saved) -> None:
         env.setdefault("serves.sampled", position.new_zeros(len(position), 9))
 
 
+def sample_play_and_mount(state: Saved) -> None:
+    """A world's gears had no play, and its paddle was where the model has it."""
+    for env in _environments(state):
+        position = env["worlds.position"]
+        env.setdefault("worlds.drawn.backlash", position.new_zeros(len(position)))
+        env.setdefault("worlds.drawn.paddle_error", position.new_zeros(len(position), 5))
+
+
 def describe_the_frames(state: Saved) -> None:
     """The sensors' delay line gets columns: 1 in a new ball's first frame, of which it held none with an older ball,
     and 1 with the ball in view, as it always was; the sensed ball has an age (saved tasks had steps of 0.02 s).
@@ -136,6 +145,14 @@ def describe_the_frames(state: Saved) -> None:
         env["sensing.ball_age"] = env["track.age"] = 0.02 * env["sensing._delay"]
         env["sensing.ball_new"] = over.new_ones(over.shape)
         env["env.predictor_valid"] = env["game.target.something_to_hit"] & env["track.something_to_hit"]
+
+
+def name_the_papers_robot(config: Saved) -> None:
+    """``t1`` was what ``t1_paper`` is now, in the robot and in the stages of the curriculum."""
+    robot = _entry(config, "robot")
+    if robot.get("name") == "t1":
+        robot["name"] = "t1_paper"
+    change_stages(config, lambda text: ["robot=t1_paper" if text == "robot=t1" else text])
 
 
 def _environments(state: Saved) -> Iterator[Saved]:
@@ -160,6 +177,7 @@ CONFIG_UPGRADES: list[Upgrade] = [
     (2, store_the_predictors_priors),
     (3, name_the_first_reading),
     (3, split_the_spin),
+    (4, name_the_papers_robot),
 ]
 #: (format that it makes, function of the training state: ``ppo``, ``regression`` and ``processes``, each of them with
 #: ``env`` and ``random``). Tensors are in their places.
@@ -167,6 +185,7 @@ STATE_UPGRADES: list[Upgrade] = [
     (3, add_what_rubber_and_air_sample),
     (3, add_the_pauses),
     (3, describe_the_frames),
+    (4, sample_play_and_mount),
 ]
 
 

@@ -34,6 +34,7 @@ from pace.evaluation.sweep import (
     variations,
     write_sweep,
 )
+from pace.evaluation.task import policy_on, task_line
 from pace.rl.policies import TaskPolicy, built_in_policy, load_policy
 from pace.runs.progress import SECONDS_PER_LINE, clock
 from pace.runs.run_folder import default_folder, make_out, versions
@@ -44,12 +45,14 @@ TASK_PARTS = ("robot", "ball", "engine", "randomization", "sensing")  # parts of
 def evaluate_from_config(composed: DictConfig) -> None:
     """Evaluate as configured, and print the results and the files."""
     config = parse(composed, EvaluateConfig)
-    policy = choose_policy(config)
+    saved = choose_policy(config)
+    policy = policy_on(config.task, saved)
     overrides = [f"engine.physics_dt={config.physics_dt}", *config.overrides]
     context = circumstances(config, policy, overrides)
     folder = Path(config.out) if config.out else default_folder("evaluation")
-    print(f"policy {policy.source}\n{describe(context)}", flush=True)
     task = override_task(policy.config, overrides)
+    told = task_line(config.task, saved.config, task)
+    print(f"policy {policy.source}\n{told}\n{describe(context)}", flush=True)
     cells = [plan_cell(change, config, policy, overrides, context["versions"]) for change in changes(config, task)]
     finished = finished_cells(folder, cells) if cells else {}
     make_out(str(folder), "evaluation")
@@ -61,7 +64,7 @@ def evaluate_from_config(composed: DictConfig) -> None:
 
 def changes(config: EvaluateConfig, task: TrainConfig) -> list[Variation]:
     """The changes of the sweep, if there is one."""
-    return variations(task, config.variations) if config.sweep else []
+    return variations(task, config.variations, config.reality) if config.sweep else []
 
 
 def evaluate_table(
@@ -73,9 +76,10 @@ def evaluate_table(
     context: Mapping[str, Any],
 ) -> None:
     """Play the rows that ``config`` names, print their table and write it with its figures into ``folder``."""
+    worlds = config.worlds_for(config.serves)
     record = partial(QualityRecorder, config=config.quality)
     rows = [
-        _with_bar(config, policy, name, name, config.serves, config.num_worlds, config.device, overrides, record)
+        _with_bar(config, policy, name, name, config.serves, worlds, config.device, overrides, record)
         for name in config.rows
     ]
     first = first_balls(config, policy, overrides)
@@ -117,6 +121,7 @@ def circumstances(config: EvaluateConfig, policy: TaskPolicy, overrides: Sequenc
     device = resolve_device(config.device)
     return {
         "policy": policy.source,
+        "task_name": config.task,
         "counters": dict(policy.counters),
         "ball": task.ball.name,
         "engine": engine_name(task, device.type),
@@ -125,7 +130,7 @@ def circumstances(config: EvaluateConfig, policy: TaskPolicy, overrides: Sequenc
         "randomization": task.randomization.name,
         "sensing": task.sensing.name,
         "seed": config.seed,
-        "num_worlds": config.num_worlds,
+        "num_worlds": config.worlds_for(config.serves),
         "warmup_serves": config.warmup_serves,
         "overrides": list(overrides),
         "versions": versions(),
@@ -191,10 +196,9 @@ def _with_bar(
     record: MakeRecorder | None = None,
 ) -> Row:
     """One row, with a progress bar of its serves."""
-    worlds = min(num_worlds, serves)
     with _bar(config, label, serves) as show:
         return evaluate_row(
-            policy, serve, serves, worlds, device, config.seed, overrides, config.warmup_serves, show, record
+            policy, serve, serves, num_worlds, device, config.seed, overrides, config.warmup_serves, show, record
         )
 
 

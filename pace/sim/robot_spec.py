@@ -31,7 +31,7 @@ class RobotSpec:
     Attributes:
         joints: the J actuated joints, in the order of actions, of ``qpos[7:]`` and of ``qvel[6:]``.
         arm: those of the joints between trunk and paddle, past the waist.
-        contacts: geoms other than the feet that can touch floor, table or paddle, in the order of ``body_contact``.
+        contacts: geoms other than the feet whose contacts are counted, in the order of ``body_contact``.
         paddle: site at the centre of the blade; the x axis of its link is the normal of the face.
         feet: sites at the centres of the left and the right sole.
         head: site at the middle of the head.
@@ -132,6 +132,9 @@ def _check(robot: RobotConfig, found: Parts) -> None:
     unsummed = sorted(set(robot.groups) - set(GROUPS))
     if unsummed:
         raise ConfigError(f"robot.groups: no reward term sums over {', '.join(unsummed)}; known: {', '.join(GROUPS)}")
+    strange = sorted(set(robot.reset_limits) - set(found.joints))
+    if strange:
+        raise ConfigError(f"robot.reset_limits: {robot.model} has no joint {', '.join(strange)}")
     for key, parts in {"arm": robot.arm, **{f"groups.{name}": parts for name, parts in robot.groups.items()}}.items():
         unknown = [part for part in parts if not _matching(found.joints, [part])]
         if unknown:

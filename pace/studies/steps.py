@@ -51,11 +51,11 @@ class Deviation:
 def replay(windows: Windows, engine: dict[str, object], friction_loss: float = 0.0) -> Motion:
     """Play the windows' targets from their states with the options ``engine``; no ball, no delay.
 
-    ``friction_loss`` is a dry friction (N m) in every joint.
+    ``friction_loss`` is a dry friction (N m) added in every joint.
     """
     config = study_config(**engine)
     model = model_of(config)
-    model.dof_frictionloss[6:] = friction_loss
+    model.dof_frictionloss[6:] += friction_loss
     count = len(windows.qpos)
     robots = make_engine(model, config.engine, count, "cpu", config.substeps)
     tips = Kinematics(model, study_spec().tips, count, config.substeps, "cpu")

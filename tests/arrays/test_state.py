@@ -37,7 +37,7 @@ STATE = {
     "statistics": "sums",
     "track": "age positions something_to_hit turned",
     "worlds": "in_view position previous_targets spin velocity",
-    "worlds.drawn": "actuator_delay until_push",
+    "worlds.drawn": "actuator_delay backlash paddle_error until_push",
     "worlds.drawn.ball": (
         "drag_coefficient magnus_coefficient mass paddle_drilling_loss paddle_friction paddle_restitution "
         "paddle_tangential_restitution table_drag table_friction table_lift table_restitution "

@@ -233,6 +233,7 @@ def test_the_command_writes_what_it_says(
     run, out = save_run(tmp_path / "a run = mine"), tmp_path / "out"
     few = [f"variations.{name}=[]" for name in ("noise", "latency", "friction", "trunk_mass", "gain")]
     sweep = ["--sweep", "sweep_rows=[short]", "sweep_serves=2", "variations.ball=[venue]", "variations.engine=[native]"]
+    sweep += ["reality=null"]
     small = ["rows=[mixed]", "serves=4", "num_worlds=2", "warmup_serves=0", "physics_dt=0.02", "progress=false"]
     small += ["ball=paper", "serve.max_duration=0.9", "first_ball=[0.0,0.1]", "first_ball_worlds=2"]
     assert run_main(monkeypatch, str(run), f"out={out}", "device=cpu", *small, *sweep, *few) == 0
@@ -294,6 +295,10 @@ def check_files(out: Path, run: Path) -> None:
         (("policy=zero", "rows=[]"), 2, "at least one serve range"),
         (("policy=zero", "physics_dt=0.003"), 2, "must divide"),
         (("policy=zero", "speed=3"), 2, "speed"),
+        (("policy=zero", "serve=short"), 2, "rows= names the serve ranges"),
+        (("policy=zero", "task=mine"), 2, "table or own"),
+        (("policy=zero", "num_worlds=0"), 2, "num_worlds must be null or at least 1"),
+        (("policy=zero", "--sweep", "reality=referees"), 2, "did you mean referee?"),
     ],
 )
 def test_bad_input_is_one_line(
@@ -330,7 +335,14 @@ def test_the_sweep_changes_one_thing_at_a_time() -> None:
 
 
 SWEEP = ["--sweep", "rows=[]", "sweep_rows=[short]", "sweep_serves=2", "warmup_serves=0", "physics_dt=0.02"]
-SWEEP += ["progress=false", "serve.max_duration=0.9", "device=cpu", "variations.ball=[venue]", "variations.engine=[]"]
+SWEEP += [
+    "reality=null",
+    "progress=false",
+    "serve.max_duration=0.9",
+    "device=cpu",
+    "variations.ball=[venue]",
+    "variations.engine=[]",
+]
 SWEEP += [f"variations.{name}=[]" for name in ("noise", "latency", "friction", "trunk_mass")]
 
 
@@ -390,8 +402,8 @@ def test_a_slow_engine_plays_fewer_serves_and_costs_more() -> None:
         plan_cell(Variation("engine", name, (f"engine={name}",)), config, policy, (), {})
         for name in ("auto", "native", "mjwarp")
     )
-    assert (native.serves, native.worlds, native.cost) == (500, 125, 4 * 125 * 6)
-    assert (warp.serves, warp.worlds, warp.cost) == (100, 25, 10 * 4 * 25 * 6)
+    assert (native.serves, native.worlds, native.cost) == (1000, 50, 50 * 22)
+    assert (warp.serves, warp.worlds, warp.cost) == (100, 5, 10 * 5 * 22)
     assert given.key == native.key != warp.key
 
 

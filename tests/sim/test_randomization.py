@@ -149,7 +149,7 @@ def test_a_ball_parameter_changes_its_world_alone(worlds: Worlds, name: str) -> 
 def test_the_actuator_delay_changes_its_world_alone(worlds: Worlds) -> None:
     def change() -> None:
         worlds.randomizer.actuator_delay[1] = 0.006
-        worlds._update_delay()
+        worlds.actuation.sample()
 
     _, robot = play(worlds, lambda: None)
     _, changed = play(worlds, change)
