@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from pace.config.sim import TableConfig
+from pace.config.ball import TableConfig
 from pace.evaluation.records import C, rates
 from pace.evaluation.serves import PATH_STEPS, Row
 from pace.task.game import Outcome

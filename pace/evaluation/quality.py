@@ -18,8 +18,8 @@ from torch import Tensor
 
 from pace.arrays.launch import Launch
 from pace.arrays.tensors import allocate, named_tensors
+from pace.config.ball import TableConfig
 from pace.config.quality import QualityConfig
-from pace.config.sim import TableConfig
 from pace.evaluation.quality_kernels import (
     HEIGHT_BIN,
     HEIGHT_BINS,

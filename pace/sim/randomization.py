@@ -16,8 +16,9 @@ from pace.arrays.draws import Column, UniformSampler, columns_of
 from pace.arrays.launch import Launch, MaskedLaunch
 from pace.arrays.state import Stateful, tensors_named, with_prefix
 from pace.arrays.tensors import allocate
+from pace.config.ball import BallConfig
 from pace.config.base import ConfigError
-from pace.config.sim import BallConfig, RandomizationConfig
+from pace.config.sim import RandomizationConfig
 from pace.sim.ball.ball import BallParams
 from pace.sim.engine.base import EngineParams
 from pace.sim.kinematics import Mount, MountArrays

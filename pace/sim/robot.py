@@ -8,8 +8,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from pace.config.ball import TableConfig
 from pace.config.base import ConfigError
-from pace.config.sim import EngineConfig, JointGroup, RobotConfig, TableConfig
+from pace.config.sim import EngineConfig, JointGroup, RobotConfig
 from pace.sim.robot_spec import PADDLE, TABLE_FORCES, TOUCH, RobotSpec, model_path, read_scene
 
 #: Name of the keyframe: nominal pose, soles on the floor.

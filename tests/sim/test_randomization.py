@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pace.config.sim import BallConfig
+from pace.config.ball import BallConfig
 from pace.config.training import TrainConfig, load_train_config
 from pace.sim.ball.ball import ball_preset
 from pace.sim.randomization import BALL_LIMITS, SAMPLED_BALL_PARAMS
