@@ -109,7 +109,7 @@ def solver_cases(windows: Windows, engines: tuple[str, ...] = ENGINES) -> list[C
     """Limits of the solver, cone and dry friction: each engine against its default step solved to the end."""
     full: dict[str, object] = {"solver_iterations": 100, "line_search_iterations": 50}
     default = study_config().engine
-    limits = ((2, 4), (4, 6), (6, 8), (default.solver_iterations, default.line_search_iterations), (20, 20))
+    limits = ((2, 4), (4, 6), (6, 8), (10, 10), (default.solver_iterations, default.line_search_iterations), (20, 20))
     settings: dict[str, dict[str, object]] = {
         f"{n} and {m} iterations": {"solver_iterations": n, "line_search_iterations": m} for n, m in limits
     }
