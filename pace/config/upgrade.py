@@ -140,6 +140,12 @@ def sample_play_and_mount(state: Saved) -> None:
         env.setdefault("worlds.drawn.paddle_error", position.new_zeros(len(position), 5))
 
 
+def count_seeds_from_zero(config: Saved) -> None:
+    """A seed is at least 0 and below 2^32; which numbers it gives to new worlds is of no meaning."""
+    if isinstance(config.get("seed"), int):
+        config["seed"] %= 2**32
+
+
 def describe_the_frames(state: Saved) -> None:
     """The sensors' delay line gets columns: 1 in a new ball's first frame, of which it held none with an older ball,
     and 1 with the ball in view, as it always was; the sensed ball has an age (saved tasks had steps of 0.02 s).
@@ -213,6 +219,7 @@ CONFIG_UPGRADES: list[Upgrade] = [
     (3, split_the_spin),
     (4, name_the_papers_robot),
     (4, name_the_hands),
+    (4, count_seeds_from_zero),
 ]
 #: (format that it makes, function of the training state: ``ppo``, ``regression`` and ``processes``, each of them with
 #: ``env`` and ``random``). Tensors are in their places.

@@ -37,7 +37,7 @@ from pace.evaluation.sweep import (
 from pace.evaluation.task import policy_on, task_line
 from pace.rl.policies import TaskPolicy, built_in_policy, load_policy
 from pace.runs.progress import SECONDS_PER_LINE, clock
-from pace.runs.run_folder import default_folder, make_out, versions
+from pace.runs.run_folder import make_out, versions
 
 TASK_PARTS = ("robot", "ball", "engine", "randomization", "sensing")  # parts of the task in the report
 
@@ -49,13 +49,12 @@ def evaluate_from_config(composed: DictConfig) -> None:
     policy = policy_on(config.task, saved)
     overrides = [f"engine.physics_dt={config.physics_dt}", *config.overrides]
     context = circumstances(config, policy, overrides)
-    folder = Path(config.out) if config.out else default_folder("evaluation")
     task = override_task(policy.config, overrides)
     told = task_line(config.task, saved.config, task)
     print(f"policy {policy.source}\n{told}\n{describe(context)}", flush=True)
     cells = [plan_cell(change, config, policy, overrides, context["versions"]) for change in changes(config, task)]
+    folder = make_out(config.out, "evaluation")
     finished = finished_cells(folder, cells) if cells else {}
-    make_out(str(folder), "evaluation")
     if config.rows:
         evaluate_table(config, policy, task, overrides, folder, context)
     if cells:

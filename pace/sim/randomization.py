@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+import mujoco
 import torch
 import warp as wp
 from torch import Tensor
@@ -104,6 +105,20 @@ def _push(
     push[world, 1] = y
 
 
+def _require_possible(name: str, sampled: tuple[float, float], limits: tuple[float, float]) -> None:
+    """Errors: :class:`ConfigError` for samples that are all beyond the limits, to which they would be clamped."""
+    if sampled[1] < limits[0] - 1e-6 or sampled[0] > limits[1] + 1e-6:
+        got = f"[{sampled[0]:g}, {sampled[1]:g}]"
+        raise ConfigError(f"randomization.{name} with this ball gives {got}: nothing within {list(limits)}")
+
+
+def require_bodies(model: mujoco.MjModel, config: RandomizationConfig) -> None:
+    """Errors: :class:`ConfigError` for a trunk without mass."""
+    trunk, least = float(model.body_mass[int(model.jnt_bodyid[0])]), config.trunk_mass[0]
+    if trunk + least <= 0.0:
+        raise ConfigError(f"randomization.trunk_mass: with {least:g} kg nothing is left of the trunk's {trunk:.1f} kg")
+
+
 class Randomizer(Stateful):
     """Samples the parameters of N worlds at reset, and the pushes in between.
 
@@ -160,6 +175,7 @@ class Randomizer(Stateful):
             nominal, ends = self._nominal_ball[name], getattr(self.config, range_name)
             low, high = (end * nominal if scales else end + nominal for end in ends)
             limits = BALL_LIMITS.get(name, (0.0, float("inf")))
+            _require_possible(range_name, (low, high), limits)
             columns.append(Column(getattr(self._ball_params, name), low, high, *limits))
         for name in LATER_ENGINE_PARAMS:
             columns.append(Column(getattr(self._engine_params, name), *getattr(self.config, name)))

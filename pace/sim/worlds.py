@@ -22,7 +22,7 @@ from pace.sim.ball.state import BallArrays, BallState
 from pace.sim.bodies import Bodies
 from pace.sim.engine.factory import make_engine
 from pace.sim.kinematics import Kinematics
-from pace.sim.randomization import Randomizer
+from pace.sim.randomization import Randomizer, require_bodies
 from pace.sim.robot import build_model, nominal_pose
 from pace.sim.robot_spec import RobotSpec
 from pace.sim.robot_state import RobotArrays, RobotState
@@ -99,6 +99,7 @@ class Worlds(Stateful):
         self.spec = RobotSpec.of(config.robot)
         self.generator = generator or torch.Generator(self.device).manual_seed(0)
         self.model = model or build_model(config.robot, config.engine, config.ball.table)
+        require_bodies(self.model, config.randomization)
         self.engine = make_engine(self.model, config.engine, num_worlds, self.device, config.substeps)
         self.kinematics = Kinematics(self.model, self.spec.tips, num_worlds, config.substeps, self.device)
         hand, steps = config.robot.paddle_hand, config.substeps

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from pace.config.base import ConfigError
 from pace.config.sim import EngineConfig
-from pace.devices import usable_cores
+from pace.cores import usable_cores
 from pace.sim.engine.base import StateTensors
 from pace.sim.engine.model_fields import ModelFields
 
