@@ -513,8 +513,8 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--scene", type=Path, default=SCENE, help="MJCF of the table, beside that of the robot")
     options = parser.parse_args()
-    if options.serves < 1 or options.noise < 0.0:
-        parser.error("--serves must be at least 1, --noise not negative")
+    if options.serves < 1 or options.seed < 0 or not 0.0 <= options.noise < float("inf"):
+        parser.error("--serves must be at least 1, --seed and --noise not negative")
     try:
         controller = Controller(options.policy)
     except (ValueError, *UNREADABLE) as error:

@@ -17,7 +17,7 @@ from pace.config.renamed import change_stages, with_current_names
 from pace.config.task import SPINS
 
 #: Format that this version writes. 1: version 0.1.0 up to commit 43400ac; 2: up to 72b96bb, before the true world;
-#: 3: up to 8d3869a, before the robot of the maker's newest numbers.
+#: 3: up to 8d3869a, before gears had play and motors the maker's numbers.
 FORMAT = 4
 
 #: Landing target of a saved configuration without one (released configuration).
@@ -34,6 +34,12 @@ NEW_BALL_SAMPLES = (
 
 #: Parameters of the robot that are sampled since format 4, and the value that changes nothing.
 NEW_ROBOT_SAMPLES = {"speed_scale": 1.0, "ankle_effort_scale": 1.0, "joint_friction": 0.0, "joint_damping": 0.0}
+
+#: Hands of the robots of this package, by their MJCF; new keys of the robot in format 4.
+HANDS: dict[str, dict[str, Any]] = {
+    "t1_paddle.xml": {"paddle_hand": [], "free_hand": "left_hand_link"},
+    "t1_29dof_paddle.xml": {"paddle_hand": ["right_hand_link"], "free_hand": "AL4"},
+}
 
 Saved = dict[str, Any]
 Upgrade = tuple[int, Callable[[Saved], None]]
@@ -126,6 +132,20 @@ def add_the_pauses(state: Saved) -> None:
         env.setdefault("serves.sampled", position.new_zeros(len(position), 9))
 
 
+def sample_play_and_mount(state: Saved) -> None:
+    """A world's gears had no play, and its paddle was where the model has it."""
+    for env in _environments(state):
+        position = env["worlds.position"]
+        env.setdefault("worlds.drawn.backlash", position.new_zeros(len(position)))
+        env.setdefault("worlds.drawn.paddle_error", position.new_zeros(len(position), 5))
+
+
+def count_seeds_from_zero(config: Saved) -> None:
+    """A seed is at least 0 and below 2^32; which numbers it gives to new worlds is of no meaning."""
+    if isinstance(config.get("seed"), int):
+        config["seed"] %= 2**32
+
+
 def describe_the_frames(state: Saved) -> None:
     """The sensors' delay line gets columns: 1 in a new ball's first frame, of which it held none with an older ball,
     and 1 with the ball in view, as it always was; the sensed ball has an age (saved tasks had steps of 0.02 s).
@@ -158,6 +178,23 @@ def name_the_papers_robot(config: Saved) -> None:
     change_stages(config, lambda text: ["robot=t1_paper" if text == "robot=t1" else text])
 
 
+def name_the_hands(config: Saved) -> None:
+    """The rule that the free hand must not touch the table holds for policies that were trained before it."""
+    robot = _entry(config, "robot")
+    for key, hand in HANDS.get(robot.get("model", ""), {}).items():
+        robot.setdefault(key, hand)
+
+
+def add_the_body(state: Saved) -> None:
+    """The robot's body was no surface, and two outcomes were not counted: they are the last of the statistics."""
+    for env in _environments(state):
+        counts, sums = env["worlds.event.edge"], env["statistics.sums"]
+        env.setdefault("worlds.event.body", counts.new_zeros(counts.shape))
+        env.setdefault("worlds.event.body_time", env["worlds.event.edge_time"].new_full(counts.shape, float("inf")))
+        env["statistics.sums"] = sums.new_zeros(len(sums) + 2)
+        env["statistics.sums"][:-2] = sums
+
+
 def _environments(state: Saved) -> Iterator[Saved]:
     """The saved tensors of each process's environment; none in a state without processes."""
     for process in state.get("processes") or ():
@@ -181,6 +218,8 @@ CONFIG_UPGRADES: list[Upgrade] = [
     (3, name_the_first_reading),
     (3, split_the_spin),
     (4, name_the_papers_robot),
+    (4, name_the_hands),
+    (4, count_seeds_from_zero),
 ]
 #: (format that it makes, function of the training state: ``ppo``, ``regression`` and ``processes``, each of them with
 #: ``env`` and ``random``). Tensors are in their places.
@@ -188,7 +227,9 @@ STATE_UPGRADES: list[Upgrade] = [
     (3, add_what_rubber_and_air_sample),
     (3, add_the_pauses),
     (3, describe_the_frames),
+    (4, sample_play_and_mount),
     (4, add_what_motors_and_joints_sample),
+    (4, add_the_body),
 ]
 
 

@@ -8,14 +8,17 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from pace.config.ball import TableConfig
 from pace.config.base import ConfigError
-from pace.config.sim import EngineConfig, JointGroup, RobotConfig, TableConfig
-from pace.sim.robot_spec import PADDLE, TOUCH, RobotSpec, model_path, read_scene
+from pace.config.sim import EngineConfig, JointGroup, RobotConfig
+from pace.sim.robot_spec import PADDLE, TABLE_FORCES, TOUCH, RobotSpec, model_path, read_scene
 
 #: Name of the keyframe: nominal pose, soles on the floor.
 NOMINAL_KEY = "nominal"
 #: Group of the geoms that are only for display.
 VISUAL_GROUP = 2
+#: Of a contact sensor: the sum of all contacts that match.
+NET_FORCE = 3
 #: The only input of a motor: its target position.
 POSITION = int(mujoco.mjtCtrlInput.mjINPUT_POS)
 
@@ -37,7 +40,7 @@ def joint_gains(robot: RobotConfig) -> NDArray[np.float64]:
 
     Errors: :class:`ConfigError` for a joint that no group of ``robot.joint_groups`` matches.
     """
-    groups = [_group(robot, name) for name in RobotSpec.of(robot).joints]
+    groups = [joint_group(robot, name) for name in RobotSpec.of(robot).joints]
     return np.array([(group.kp, group.kd, group.effort) for group in groups]).T
 
 
@@ -50,7 +53,7 @@ def motor_lines(robot: RobotConfig) -> NDArray[np.float64] | None:
     if not robot.stall_ratio:
         return None
     stall = robot.stall_ratio * joint_gains(robot)[2]
-    return np.array([[_group(robot, name).max_speed for name in RobotSpec.of(robot).joints], stall])
+    return np.array([[joint_group(robot, name).max_speed for name in RobotSpec.of(robot).joints], stall])
 
 
 def joint_armature(robot: RobotConfig) -> NDArray[np.float64]:
@@ -58,7 +61,7 @@ def joint_armature(robot: RobotConfig) -> NDArray[np.float64]:
 
     Errors: those of :func:`joint_gains`.
     """
-    found = [_group(robot, name).armature for name in RobotSpec.of(robot).joints]
+    found = [joint_group(robot, name).armature for name in RobotSpec.of(robot).joints]
     return np.array([robot.armature if armature is None else armature for armature in found])
 
 
@@ -67,10 +70,14 @@ def joint_friction(robot: RobotConfig) -> NDArray[np.float64]:
 
     Errors: those of :func:`joint_gains`.
     """
-    return np.array([_group(robot, name).friction for name in RobotSpec.of(robot).joints])
+    return np.array([joint_group(robot, name).friction for name in RobotSpec.of(robot).joints])
 
 
-def _group(robot: RobotConfig, name: str) -> JointGroup:
+def joint_group(robot: RobotConfig, name: str) -> JointGroup:
+    """The group of ``robot.joint_groups`` that counts for the joint ``name``.
+
+    Errors: :class:`ConfigError` if none matches.
+    """
     group = next((g for g in robot.joint_groups if any(part in name for part in g.match)), None)
     if group is None:
         raise ConfigError(f"robot.joint_groups: no group matches joint {name}")
@@ -87,8 +94,8 @@ def build_model(robot: RobotConfig, engine: EngineConfig, table: TableConfig, vi
         visual: keep the geoms that are only for display. The dynamics are the same with and without them;
             physics leaves them out because each costs time in every step.
 
-    Errors: :class:`ConfigError` for gains or a pose that do not fit the robot's joints, and for pairs of
-    ``robot.self_collision`` that the MJCF lacks a geom for, or lists already.
+    Errors: :class:`ConfigError` for gains or a pose that do not fit the robot's joints, for a free hand that the robot
+    does not have, and for pairs of ``robot.self_collision`` that the MJCF lacks a geom for, or lists already.
     """
     return compile_scene(describe_scene(robot, engine, table, visual), robot)
 
@@ -102,6 +109,7 @@ def describe_scene(robot: RobotConfig, engine: EngineConfig, table: TableConfig,
         _add_pairs(spec, robot.self_collision)
         _count_the_world_alone(spec)
     _fit_table(spec, table)
+    _sense_table(spec, robot.free_hand)
     spec.option.timestep = engine.physics_dt
     spec.option.iterations = engine.solver_iterations
     spec.option.ls_iterations = engine.line_search_iterations
@@ -138,7 +146,7 @@ def _set_motors(spec: mujoco.MjSpec, robot: RobotConfig) -> None:
     for name, (kp, kd, effort) in zip(RobotSpec.of(robot).joints, joint_gains(robot).T, strict=True):
         actuator = spec.actuator(name)
         if robot.stall_ratio:
-            _set_line(actuator, kp, kd, _group(robot, name).max_speed, robot.stall_ratio * effort)
+            _set_line(actuator, kp, kd, joint_group(robot, name).max_speed, robot.stall_ratio * effort)
         else:
             actuator.set_to_position(kp=kp, kv=kd)
         actuator.forcerange = [-effort, effort]
@@ -210,6 +218,19 @@ def _fit_table(spec: mujoco.MjSpec, table: TableConfig) -> None:
         if geom is not None:  # for the eye only; a robot may do without
             geom.size[:2] = (table.paddle_radius - 0.0005, 0.001)
             geom.pos[0] = side * (table.paddle_half_thickness - 0.0007)
+
+
+def _sense_table(spec: mujoco.MjSpec, free_hand: str) -> None:
+    """Append the sensors of :data:`TABLE_FORCES`: net contact forces of the table, world frame."""
+    if free_hand and spec.body(free_hand) is None:
+        raise ConfigError(f"robot.free_hand: the robot has no body {free_hand}")
+    reported = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE)
+    for name in TABLE_FORCES if free_hand else TABLE_FORCES[:1]:
+        sensor = spec.add_sensor(name=name, type=mujoco.mjtSensor.mjSENS_CONTACT)
+        sensor.objtype, sensor.objname = mujoco.mjtObj.mjOBJ_GEOM, "table"
+        if name != TABLE_FORCES[0]:  # the hand's body and all that it carries
+            sensor.reftype, sensor.refname = mujoco.mjtObj.mjOBJ_XBODY, free_hand
+        sensor.intprm[:3] = (reported, NET_FORCE, 1)
 
 
 def _standing(model: mujoco.MjModel, pose: NDArray[np.float64], soles: Sequence[str]) -> NDArray[np.float64]:

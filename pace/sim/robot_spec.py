@@ -20,6 +20,9 @@ ASSETS = Path(__file__).parent / "assets"
 #: Suffix of the sensors that count the contacts of a geom.
 TOUCH = "_touch"
 FEET = 2  # left and right
+#: Names of the sensors that :func:`pace.sim.robot.build_model` appends: force of the table (N, world frame) on the
+#: whole robot, and on its free hand if it has one.
+TABLE_FORCES = ("table_force", "free_hand_force")
 #: Groups of joints that reward terms sum over (``pace.task.state_kernels``); a robot may lack some.
 GROUPS = ("ankles", "hip_waist_left_arm", "left_shoulder_roll", "right_arm")
 PADDLE = "paddle"  # geom of the blade, a cylinder

@@ -1,5 +1,5 @@
 """The studies by name: engine parity, step sizes, solver settings, paddle reaction, motors, cost of the robots,
-ankles, predictors and their error bounds, posture, adaptation to the paddle, on-board estimates, bf16 rounding in
+ankles, predictors and their error bounds, adaptation to the paddle, on-board estimates, bf16 rounding in
 the update, the balls of a machine, the learning curves of the recipes that were tried, and the rooms of the package.
 
 They print the tables of the pages in ``docs/results`` and draw their figures.
@@ -23,7 +23,6 @@ from pace.studies import (
     learning_curves,
     motors,
     parity,
-    posture,
     predictor,
     reaction,
     recipe,
@@ -97,10 +96,6 @@ def study_ankles(options: Options) -> None:
     print(ankles.table(ankles.compare(load_policy(options.run or GENERALIST), options.worlds, options.serves)))
 
 
-def study_posture(options: Options) -> None:
-    print(posture.table(posture.postures(_policies(options), options.worlds, options.serves)))
-
-
 def study_adaptation(options: Options) -> None:
     found = adaptation.adaptations(_policies(options), options.worlds)
     print(adaptation.table(found))
@@ -166,7 +161,6 @@ STUDIES = {
     "robots": study_robots,
     "ankles": study_ankles,
     "predictor": study_predictor,
-    "posture": study_posture,
     "adaptation": study_adaptation,
     "senses": study_senses,
     "rounding": study_rounding,

@@ -13,7 +13,8 @@ import torch
 from pace.config.base import ConfigError
 from pace.config.sim import RobotConfig
 from pace.config.training import load_train_config
-from pace.evaluation.serves import ServeRecorder, play, summarise
+from pace.evaluation.records import summarise
+from pace.evaluation.serves import ServeRecorder, play
 from pace.rl.policies import TaskPolicy, load_policy
 from pace.runs.metrics import markdown
 from pace.sim.robot import motor_lines

@@ -37,7 +37,7 @@ STATE = {
     "statistics": "sums",
     "track": "age positions something_to_hit turned",
     "worlds": "in_view position previous_targets spin velocity",
-    "worlds.drawn": "actuator_delay until_push",
+    "worlds.drawn": "actuator_delay backlash paddle_error until_push",
     "worlds.drawn.ball": (
         "drag_coefficient magnus_coefficient mass paddle_drilling_loss paddle_friction paddle_restitution "
         "paddle_tangential_restitution table_drag table_friction table_lift table_restitution "
@@ -49,7 +49,7 @@ STATE = {
     ),
     "worlds.engine": "body_contact foot_force joint_torque qpos qpos_path qvel qvel_path warmstart",
     "worlds.event": (
-        "bounce_position edge edge_time floor floor_time hit_normal hit_offset hit_point hit_position "
+        "body body_time bounce_position edge edge_time floor floor_time hit_normal hit_offset hit_point hit_position "
         "hit_relative_velocity hit_rim hit_spin_out hit_velocity_in hit_velocity_out impulse_point net "
         "net_time opponent_bounce opponent_bounce_time own_bounce own_bounce_time paddle_hit paddle_hit_time "
         "paddle_impulse"

@@ -119,6 +119,9 @@ def old_env(worlds: int = 3) -> dict[str, torch.Tensor]:
         "sensing._delay": torch.full((worlds,), 0.5),
         "worlds.drawn.ball.mass": torch.full((worlds,), 0.0027),
         "worlds.drawn.engine.effort_scale": torch.full((worlds,), 0.97),
+        "worlds.event.edge": torch.zeros(worlds, dtype=torch.int32),
+        "worlds.event.edge_time": torch.full((worlds,), torch.inf),
+        "statistics.sums": torch.arange(16.0),
         "worlds.position": torch.rand(worlds, 3),
         "game.ends.over": flags,
         "game.ends.outcome": flags.int(),
@@ -143,6 +146,20 @@ def test_a_state_of_format_2_gets_what_the_true_world_keeps() -> None:
     assert env["worlds.in_view"].all()
     assert not env["game.pause.waiting"].any()
     assert env["serves.sampled"].shape == (3, 9)
+    assert env["worlds.drawn.backlash"].tolist() == [0.0] * 3
+    assert env["worlds.drawn.paddle_error"].tolist() == [[0.0] * 5] * 3
+    assert env["worlds.event.body"].tolist() == [0] * 3
+    assert env["worlds.event.body_time"].isinf().all()
+    assert env["statistics.sums"].tolist() == [*range(16), 0, 0]
+
+
+@pytest.mark.parametrize("robot", ["t1", "t1_29dof"])
+def test_a_saved_robot_has_the_hands_of_its_mjcf(robot: str) -> None:
+    now = to_dict(load_train_config([f"robot={robot}"]))
+    old = deepcopy(now)
+    for key in ("paddle_hand", "free_hand"):
+        del old["robot"][key]
+    assert upgrade_config(old, 3)["robot"] == now["robot"]
 
 
 @pytest.mark.parametrize("policy", sorted(path.name for path in Path("pretrained").glob("*/")))

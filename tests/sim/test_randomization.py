@@ -10,7 +10,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from pace.config.sim import BallConfig
+from pace.config.ball import BallConfig
+from pace.config.base import ConfigError
 from pace.config.training import TrainConfig, load_train_config
 from pace.sim.ball.ball import ball_preset
 from pace.sim.randomization import BALL_LIMITS, SAMPLED_BALL_PARAMS
@@ -185,7 +186,7 @@ def test_a_ball_parameter_changes_its_world_alone(worlds: Worlds, name: str) -> 
 def test_the_actuator_delay_changes_its_world_alone(worlds: Worlds) -> None:
     def change() -> None:
         worlds.randomizer.actuator_delay[1] = 0.006
-        worlds._update_delay()
+        worlds.actuation.sample()
 
     _, robot = play(worlds, lambda: None)
     _, changed = play(worlds, change)
@@ -210,3 +211,16 @@ def test_a_reset_resamples_its_world_alone(engine: str) -> None:
     (robot, ball), (new_robot, new_ball) = seen
     assert_only_world_1_changed(robot, new_robot, 1e-2)
     assert_only_world_1_changed(ball, new_ball, 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("randomization.trunk_mass=[-20,2]", r"randomization.trunk_mass: with -20 kg nothing is left of the trunk's"),
+        ("randomization.paddle_restitution=[-1,-0.9]", r"paddle_restitution with this ball gives \[-0.122, -0.022\]"),
+        ("randomization.table_friction=[-9,-8]", r"table_friction with this ball gives \[-8.75, -7.75\]"),
+    ],
+)
+def test_a_body_that_cannot_be_is_refused(override: str, words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        Worlds(load_train_config([override]), 1, "cpu")

@@ -205,7 +205,17 @@ def test_ball_is_a_mocap_body_that_touches_nothing(model):
 
 def test_every_contact_body_has_its_sensor_in_order(model):
     names = [model.sensor(i).name for i in range(model.nsensor)]
-    assert names == ["left_foot_force", "right_foot_force", *(f"{body}_touch" for body in CONTACT_BODIES)]
+    touches = [f"{body}_touch" for body in CONTACT_BODIES]
+    assert names == ["left_foot_force", "right_foot_force", *touches, "table_force", "free_hand_force"]
+
+
+def test_a_robot_without_a_free_hand_has_no_sensor_for_it(config):
+    for hand, count in (("left_hand_link", 2), ("", 1)):
+        robot = dataclasses.replace(config.robot, free_hand=hand)
+        model = build_model(robot, config.engine, config.ball.table)
+        assert model.nsensordata == 2 * 3 + len(CONTACT_BODIES) + 3 * count
+    with pytest.raises(ConfigError, match=r"robot\.free_hand: the robot has no body third_hand"):
+        build_model(dataclasses.replace(config.robot, free_hand="third_hand"), config.engine, config.ball.table)
 
 
 def test_wrong_joint_names_are_config_errors(config):

@@ -286,7 +286,7 @@ def test_the_action_is_scaled_clipped_and_remembered(shared: TableTennisEnv) -> 
     shared.reset_worlds(torch.ones(N, dtype=torch.bool))
     action = 0.1 * torch.arange(21.0).repeat(N, 1)
     shared.advance(action)
-    torch.testing.assert_close(shared.worlds._previous_targets, shared.worlds.nominal + 0.25 * action)
+    torch.testing.assert_close(shared.worlds.actuation.held[:, 0], shared.worlds.nominal + 0.25 * action)
     frame = shared.policy_observation.view(N, 5, 90)[:, -1]
     torch.testing.assert_close(frame[:, shared.policy_layout["previous_action"]], action)
 

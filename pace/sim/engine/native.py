@@ -15,7 +15,7 @@ from torch import Tensor
 
 from pace.config.base import ConfigError
 from pace.config.sim import EngineConfig
-from pace.devices import usable_cores
+from pace.cores import usable_cores
 from pace.sim.engine.base import StateTensors
 from pace.sim.engine.model_fields import ModelFields
 
@@ -51,6 +51,8 @@ class NativeEngine(StateTensors):
         self._record = {name: np.zeros((num_worlds, substeps, width)) for name, width in widths.items()}
         self._sensordata = torch.from_numpy(self._record["sensordata"])[:, -1]
         self._actuator_force = torch.from_numpy(self._record["actuator_force"])[:, -1]
+        self._on_table = self._record["sensordata"][..., model.nsensordata - 3 * self.table_force.shape[2] :]
+        self._table_force = self.table_force.numpy().reshape(self._on_table.shape)
         # NumPy copies: torch's would wake torch's threads beside the pool's, which costs milliseconds on busy cores
         self._paths = {"qpos": self.qpos_path.numpy(), "qvel": self.qvel_path.numpy()}
         self._qpos[:] = self._paths["qpos"][:, 0]
@@ -63,6 +65,7 @@ class NativeEngine(StateTensors):
         self._roll_out()
         for name, path in self._paths.items():
             path[:, 1:] = self._record[name]
+        self._table_force[:] = self._on_table
         self._read_sensors(self._sensordata, self._actuator_force)
 
     def _roll_out(self) -> None:

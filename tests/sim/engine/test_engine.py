@@ -377,6 +377,62 @@ def test_paddle_in_the_table_is_seen(fresh):
     assert not engine.body_contact[:3].any()
 
 
+def beside_the_table(model):
+    """Standing away from it; left forearm, held forwards, 2 mm in its top; thighs 2 mm in its end; paddle in it."""
+    data, at = mujoco.MjData(model), standing(model)
+    at[1, 7 + JOINT_NAMES.index("Left_Shoulder_Pitch")] = -1.57
+    for world, name, place in ((1, "left_forearm", [-1.25, 0.2, 0.758]), (3, "paddle", [-1.3, 0.2, 0.758])):
+        put_lowest(model, data, at[world], name, np.array(place))
+    data.qpos[:] = at[2]
+    mujoco.mj_kinematics(model, data)
+    front = np.array([-1.368 - model.geom("left_thigh").size[0], 0.2, 0.745])
+    at[2, :3] += torch.tensor(front - data.geom("left_thigh").xpos, dtype=torch.float32)
+    return at
+
+
+def put_lowest(model, data, qpos, name, place):
+    """Move a robot so that the lowest point of a capsule, or about that of a cylinder, is at ``place``."""
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(model, data)
+    steep, size = abs(data.geom(name).xmat[8]), model.geom(name).size
+    depth = size[1] * steep + size[0] * (np.sqrt(1 - steep**2) if name == "paddle" else 1.0)
+    lift = np.array([0.0, 0.0, depth])
+    qpos[:3] += torch.tensor(place + lift - data.geom(name).xpos, dtype=torch.float32)
+
+
+def forces_on_the_robot(model, data):
+    """Sums (2, 3) N of MuJoCo's contact forces between table and robot, and table and left forearm."""
+    table, forearm, sums = model.geom("table").id, model.geom("left_forearm").id, np.zeros((2, 3))
+    for index, contact in enumerate(data.contact[: data.ncon]):
+        if table in contact.geom:
+            wrench = np.zeros(6)
+            mujoco.mj_contactForce(model, data, index, wrench)
+            force = contact.frame.reshape(3, 3).T @ wrench[:3] * (1.0 if contact.geom[0] == table else -1.0)
+            sums += np.array([force, force * (forearm in contact.geom)])
+    return sums
+
+
+def test_forces_on_the_table_are_mujocos_contact_forces(fresh):
+    engine, model = fresh
+    at = beside_the_table(model)
+    engine.reset(EVERY, at, STILL)
+    engine.advance(hold(engine), STILL)
+    assert engine.table_force.shape == (WORLDS, 2, 2, 3)
+    for world in range(WORLDS):
+        data = mujoco.MjData(model)
+        data.qpos[:], data.ctrl[:] = at[world], NOMINAL
+        for step in range(2):
+            mujoco.mj_step(model, data)
+            found, expected = engine.table_force[world, step], forces_on_the_robot(model, data)
+            np.testing.assert_allclose(found, expected, atol=0.02 * np.abs(expected).max() + 1e-6)
+    whole, hand = engine.table_force[:, 0].unbind(1)
+    assert not whole[0].any()
+    assert not hand[[0, 2, 3]].any()
+    assert whole[1, 2] > hand[1, 2] > hand[1, :2].norm()  # N, upwards from the top, on which the paddle lies too
+    assert whole[2, 0] < -whole[2, 1:].norm()  # away from its end
+    assert whole[3, 2] > whole[3, :2].norm()
+
+
 def test_applied_force_moves_the_base(fresh):
     engine, model = fresh
     engine.reset(EVERY, standing(model, lift=1.0), STILL)
