@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 from pace.config.base import require
+from pace.config.quality import QualityConfig, check_first_ball
 from pace.config.training import TrainConfig
 
 
@@ -73,14 +75,16 @@ class EvaluateConfig:
 
     run: str | None
     policy: str  # run, zero, random
+    task: str  # table, own
     rows: list[str]  # names of configs/serve/
     serves: int  # least number of serves per row
     warmup_serves: int  # first serves of each world, not counted
-    num_worlds: int
+    balls_per_world: int  # counted
+    num_worlds: int | None  # None: as many as balls_per_world asks for
     device: str
     seed: int
     physics_dt: float  # s
-    overrides: list[str]  # of the saved task
+    overrides: list[str]  # of the task
     out: str | None
     progress: bool
     sweep: bool
@@ -88,6 +92,12 @@ class EvaluateConfig:
     sweep_serves_slow: int  # the same for mjwarp on a CPU
     sweep_rows: list[str]
     variations: VariationConfig
+    reality: str | None  # a file of configs/realities/
+    first_ball: list[float]  # s that robots stand ready before their first ball
+    first_ball_worlds: int  # robots for each of these times
+    first_ball_serve: str  # a name of configs/serve/
+    first_ball_kind: str  # what the ball does until then: a key of serve.pause_ball
+    quality: QualityConfig
     paper: dict[str, PaperRow]
     plugins: list[str] = field(default_factory=list)  # modules that add what the saved task needs
 
@@ -96,9 +106,18 @@ class EvaluateConfig:
         require(self.policy != "run" or self.run is not None, "which run? give its folder, or policy=zero|random")
         require(len(self.rows) > 0 or self.sweep, "rows must name at least one serve range")
         require(len(self.sweep_rows) > 0 or not self.sweep, "sweep_rows must name at least one serve range")
-        for name in ("serves", "sweep_serves", "sweep_serves_slow", "num_worlds"):
+        require(self.task in ("table", "own"), f"task must be table or own, not {self.task!r}")
+        for name in ("serves", "sweep_serves", "sweep_serves_slow", "balls_per_world"):
             require(getattr(self, name) >= 1, f"{name} must be at least 1, got {getattr(self, name)}")
+        given = self.num_worlds is None or self.num_worlds >= 1
+        require(given, f"num_worlds must be null or at least 1, got {self.num_worlds}")
         require(self.warmup_serves >= 0, f"warmup_serves must not be negative, got {self.warmup_serves}")
+        check_first_ball(self.first_ball, self.first_ball_worlds, self.first_ball_kind)
+
+    def worlds_for(self, serves: int) -> int:
+        """Worlds that play a row of ``serves``."""
+        worlds = math.ceil(serves / self.balls_per_world) if self.num_worlds is None else self.num_worlds
+        return min(worlds, serves)
 
 
 @dataclass

@@ -17,7 +17,7 @@ from pace.config.renamed import change_stages, with_current_names
 from pace.config.task import SPINS
 
 #: Format that this version writes. 1: version 0.1.0 up to commit 43400ac; 2: up to 72b96bb, before the true world;
-#: 3: up to 8d3869a, before the robot of the maker's newest numbers.
+#: 3: up to 8d3869a, before gears had play and motors the maker's numbers.
 FORMAT = 4
 
 #: Landing target of a saved configuration without one (released configuration).
@@ -31,6 +31,9 @@ NEW_BALL_SAMPLES = (
     "paddle_tangential_restitution",
     "paddle_drilling_loss",
 )
+
+#: Parameters of the robot that are sampled since format 4, and the value that changes nothing.
+NEW_ROBOT_SAMPLES = {"speed_scale": 1.0, "ankle_effort_scale": 1.0, "joint_friction": 0.0, "joint_damping": 0.0}
 
 #: Hands of the robots of this package, by their MJCF; new keys of the robot in format 4.
 HANDS: dict[str, dict[str, Any]] = {
@@ -129,6 +132,20 @@ def add_the_pauses(state: Saved) -> None:
         env.setdefault("serves.sampled", position.new_zeros(len(position), 9))
 
 
+def sample_play_and_mount(state: Saved) -> None:
+    """A world's gears had no play, and its paddle was where the model has it."""
+    for env in _environments(state):
+        position = env["worlds.position"]
+        env.setdefault("worlds.drawn.backlash", position.new_zeros(len(position)))
+        env.setdefault("worlds.drawn.paddle_error", position.new_zeros(len(position), 5))
+
+
+def count_seeds_from_zero(config: Saved) -> None:
+    """A seed is at least 0 and below 2^32; which numbers it gives to new worlds is of no meaning."""
+    if isinstance(config.get("seed"), int):
+        config["seed"] %= 2**32
+
+
 def describe_the_frames(state: Saved) -> None:
     """The sensors' delay line gets columns: 1 in a new ball's first frame, of which it held none with an older ball,
     and 1 with the ball in view, as it always was; the sensed ball has an age (saved tasks had steps of 0.02 s).
@@ -143,6 +160,22 @@ def describe_the_frames(state: Saved) -> None:
         env["sensing.ball_age"] = env["track.age"] = 0.02 * env["sensing._delay"]
         env["sensing.ball_new"] = over.new_ones(over.shape)
         env["env.predictor_valid"] = env["game.target.something_to_hit"] & env["track.something_to_hit"]
+
+
+def add_what_motors_and_joints_sample(state: Saved) -> None:
+    """A world's samples of ``engine`` that did not exist."""
+    for env in _environments(state):
+        rows = env["worlds.drawn.engine.effort_scale"]
+        for name, value in NEW_ROBOT_SAMPLES.items():
+            env.setdefault(f"worlds.drawn.engine.{name}", rows.new_full(rows.shape, value))
+
+
+def name_the_papers_robot(config: Saved) -> None:
+    """``t1`` was what ``t1_paper`` is now, in the robot and in the stages of the curriculum."""
+    robot = _entry(config, "robot")
+    if robot.get("name") == "t1":
+        robot["name"] = "t1_paper"
+    change_stages(config, lambda text: ["robot=t1_paper" if text == "robot=t1" else text])
 
 
 def name_the_hands(config: Saved) -> None:
@@ -184,7 +217,9 @@ CONFIG_UPGRADES: list[Upgrade] = [
     (2, store_the_predictors_priors),
     (3, name_the_first_reading),
     (3, split_the_spin),
+    (4, name_the_papers_robot),
     (4, name_the_hands),
+    (4, count_seeds_from_zero),
 ]
 #: (format that it makes, function of the training state: ``ppo``, ``regression`` and ``processes``, each of them with
 #: ``env`` and ``random``). Tensors are in their places.
@@ -192,6 +227,8 @@ STATE_UPGRADES: list[Upgrade] = [
     (3, add_what_rubber_and_air_sample),
     (3, add_the_pauses),
     (3, describe_the_frames),
+    (4, sample_play_and_mount),
+    (4, add_what_motors_and_joints_sample),
     (4, add_the_body),
 ]
 

@@ -12,10 +12,11 @@ from typing import Any
 
 import torch
 
-from pace.config.base import to_dict
+from pace.config.base import ConfigError, to_dict
 from pace.config.commands import EvaluateConfig, VariationConfig
 from pace.config.names import choices
 from pace.config.overrides import override_task
+from pace.config.realities import load_realities
 from pace.config.sim import RandomizationConfig
 from pace.config.training import TrainConfig
 from pace.devices import resolve_device
@@ -25,10 +26,11 @@ from pace.evaluation.serves import EvaluationError
 from pace.rl.policies import TaskPolicy
 
 JSON, MAP = "sweep.json", "sweep.png"
-SERVES_PER_WORLD = 4  # counted, in a cell: more waste a smaller share on uncounted serves, but fill fewer cores
 SLOWNESS = 10.0  # times that mjwarp takes on a CPU (docs/results/speed.md), for the time that is left
 Tables = dict[str, list[dict[str, Any]]]  # summaries of a cell's rows, by its key
-LABELS = {"noise": "sensing noise", "trunk_mass": "trunk mass", "gain": "joint gains"}
+#: Kinds of change by what they are called before their value in the heat map; others by their own name.
+LABELS = {"noise": "sensing noise", "trunk_mass": "trunk mass", "gain": "joint gains", "pauses": "pauses of"}
+LABELS |= dict.fromkeys(("spin", "sensing", "acting", "place"), "")
 
 
 @dataclass(frozen=True)
@@ -50,8 +52,12 @@ def ball_presets() -> list[str]:
     return choices("ball")
 
 
-def variations(task: TrainConfig, chosen: VariationConfig) -> list[Variation]:
-    """The unchanged task, then each change of ``chosen``; changes start from the values of ``task``."""
+def variations(task: TrainConfig, chosen: VariationConfig, reality: str | None = None) -> list[Variation]:
+    """The unchanged task, then each change of ``chosen``, which starts from the values of ``task``, then the rows of
+    ``configs/realities/<reality>.yaml``.
+
+    Errors: :class:`ConfigError` that names the row, for one that does not fit the task.
+    """
     sensing, bodies = task.sensing, task.randomization
     cells = [Variation("as given", "", ())]
     cells += [Variation("ball", name, (f"ball={name}",)) for name in chosen.ball or ball_presets()]
@@ -69,7 +75,21 @@ def variations(task: TrainConfig, chosen: VariationConfig) -> list[Variation]:
             _range(f"randomization.{n}", [v * times for v in getattr(bodies, n)]) for n in ("kp_scale", "kd_scale")
         )
         cells.append(Variation("gain", f"x {times:g}", stronger))
-    return cells
+    return cells + ([] if reality is None else _rows_of(task, reality))
+
+
+def _rows_of(task: TrainConfig, reality: str) -> list[Variation]:
+    rows = [
+        Variation(kind, label, tuple(overrides))
+        for kind, named in load_realities(reality).items()
+        for label, overrides in named.items()
+    ]
+    for row in rows:
+        try:
+            override_task(task, row.overrides)
+        except ConfigError as error:
+            raise ConfigError(f"reality={reality}, {row.kind}, {row.value}: {error}") from error
+    return rows
 
 
 def _shift(bodies: RandomizationConfig, name: str, offset: float, unit: str, lowest: float | None = None) -> Variation:
@@ -124,7 +144,7 @@ def plan_cell(
         changed = (*changed, "engine.graph=auto")
     slow = task.engine.name == "mjwarp" and device.type == "cpu"
     serves = config.sweep_serves_slow if slow else config.sweep_serves
-    worlds = min(config.num_worlds, math.ceil(serves / SERVES_PER_WORLD))
+    worlds = config.worlds_for(serves)
     played = worlds * (config.warmup_serves + math.ceil(serves / worlds)) * len(config.sweep_rows)
     depends = [policy.source, dict(policy.counters), config.seed, config.warmup_serves, config.sweep_rows, serves]
     text = json.dumps([*depends, worlds, str(device), program, to_dict(task)], sort_keys=True)

@@ -44,6 +44,19 @@ class TipArrays:
     """:class:`Tips` in the kernels' form."""
 
 
+@dataclass(eq=False)
+class Mount:
+    """Where the paddle of each of N worlds is, in its link: that of the model at ``offset`` 0 and ``normal`` x."""
+
+    offset: Vec3  # m, of the centre from the model's paddle site
+    normal: Vec3  # unit vector
+
+
+@struct_of(Mount)
+class MountArrays:
+    """:class:`Mount` in the kernels' form."""
+
+
 @wp.struct
 class Chains:
     """Kinematic chains from the base to each tip: the joints of chain c are links start[c] to start[c + 1] - 1."""
@@ -121,6 +134,7 @@ def _store(row: wp.array[float], start: int, value: wp.vec3):
 def _update(
     mask: wp.array[wp.bool],
     chains: Chains,
+    mount: MountArrays,
     qpos_path: wp.array3d[float],
     qvel_path: wp.array3d[float],
     tips: TipArrays,
@@ -136,9 +150,10 @@ def _update(
     qvel = qvel_path[world, instant]
     tip = _tip(chains, chain, _base(qpos, qvel), qpos, qvel)
     if chain == PADDLE:
+        tip = _moved(tip, mount.offset[world])
         row = tips.paddle_path[world, instant]
         _store(row, 0, tip.position)
-        _store(row, 3, wp.quat_rotate(tip.rotation, wp.vec3(1.0, 0.0, 0.0)))
+        _store(row, 3, wp.quat_rotate(tip.rotation, mount.normal[world]))
         _store(row, 6, tip.velocity)
         _store(row, 9, tip.angular_velocity)
     elif chain == HEAD:
@@ -228,6 +243,9 @@ class Kinematics(Tips):
         self._device, self._num_tips = torch.device(device), len(tips)
         self._chains = _build_chains(model, tips, wp.device_from_torch(self._device))
         self._num_worlds = num_worlds
+        #: Where the paddles are; edited in place.
+        self.mount = allocate(Mount, num_worlds, device)
+        self.mount.normal[:, 0] = 1.0
         super().__init__(**vars(allocate(Tips, num_worlds, device, instants=substeps + 1, columns=12, feet=FEET)))
         self._path: tuple[Tensor, Tensor] | None = None
         n, instants = num_worlds, substeps + 1
@@ -246,7 +264,7 @@ class Kinematics(Tips):
     def _record_update(self, qpos_path: Tensor, qvel_path: Tensor) -> MaskedLaunch:
         self._path = (qpos_path, qvel_path)
         worlds, instants, _ = self.paddle_path.shape
-        given = {"chains": self._chains, "qpos_path": qpos_path, "qvel_path": qvel_path}
+        given = {"chains": self._chains, "mount": self.mount, "qpos_path": qpos_path, "qvel_path": qvel_path}
         return MaskedLaunch(_update, (worlds, instants + self._num_tips - 1), self._device, tips=self, **given)
 
     def paddle_generalized_force(self, force: Tensor, point: Tensor, out: Tensor) -> None:

@@ -11,17 +11,18 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from pace.arrays.launch import Bound, Launch, MaskedLaunch
+from pace.arrays.launch import Bound, MaskedLaunch
 from pace.arrays.state import Stateful, tensors_named, under_prefix, with_prefix
 from pace.arrays.tensors import named_tensors
 from pace.config.sim import SimConfig
 from pace.devices import resolve_device
+from pace.sim.actuation import Actuation
 from pace.sim.ball.ball import BallParams, BallSim
 from pace.sim.ball.state import BallArrays, BallState
 from pace.sim.bodies import Bodies
 from pace.sim.engine.factory import make_engine
 from pace.sim.kinematics import Kinematics
-from pace.sim.randomization import Randomizer
+from pace.sim.randomization import Randomizer, require_bodies
 from pace.sim.robot import build_model, nominal_pose
 from pace.sim.robot_spec import RobotSpec
 from pace.sim.robot_state import RobotArrays, RobotState
@@ -55,27 +56,11 @@ def _derive(
 
 
 @wp.kernel
-def _spread_delay(delay: wp.array[float], physics_dt: float, new_share: wp.array2d[float]):
-    """Share of each physics step that is left after the new target has passed the actuator delay."""
+def _forget_impulse(mask: wp.array[wp.bool], impulse: wp.array[wp.vec3]):
+    """A robot that was just reset gets no impulse of the last ball."""
     world = wp.tid()
-    for step in range(new_share.shape[1]):
-        new_share[world, step] = wp.clamp((float(step + 1) * physics_dt - delay[world]) / physics_dt, 0.0, 1.0)
-
-
-@wp.kernel
-def _stand(
-    mask: wp.array[wp.bool],
-    qpos: wp.array3d[float],
-    previous_targets: wp.array2d[float],
-    impulse: wp.array[wp.vec3],
-):
-    """A robot that was just reset holds its joint positions and gets no impulse of the last ball."""
-    world = wp.tid()
-    if not mask[world]:
-        return
-    for joint in range(previous_targets.shape[1]):
-        previous_targets[world, joint] = qpos[world, 0, 7 + joint]
-    impulse[world] = wp.vec3()
+    if mask[world]:
+        impulse[world] = wp.vec3()
 
 
 @wp.kernel
@@ -114,6 +99,7 @@ class Worlds(Stateful):
         self.spec = RobotSpec.of(config.robot)
         self.generator = generator or torch.Generator(self.device).manual_seed(0)
         self.model = model or build_model(config.robot, config.engine, config.ball.table)
+        require_bodies(self.model, config.randomization)
         self.engine = make_engine(self.model, config.engine, num_worlds, self.device, config.substeps)
         self.kinematics = Kinematics(self.model, self.spec.tips, num_worlds, config.substeps, self.device)
         hand, steps = config.robot.paddle_hand, config.substeps
@@ -137,35 +123,36 @@ class Worlds(Stateful):
             self.generator,
             self.model.nv,
             self.control_dt,
+            self.kinematics.mount,
         )
         self.engine.apply_params(torch.ones(num_worlds, dtype=torch.bool, device=self.device))
         self._warned = False
         self._allocate()
 
     def _allocate(self) -> None:
-        n, device, joints = self.num_worlds, self.device, len(self.spec.joints)
+        n, device = self.num_worlds, self.device
         self.nominal = torch.as_tensor(nominal_pose(self.config.robot), dtype=torch.float32, device=device)
         limits = torch.as_tensor(self.model.jnt_range[1:], dtype=torch.float32, device=device)
         self.joint_lower, self.joint_upper = limits[:, 0].contiguous(), limits[:, 1].contiguous()
-        self._previous_targets = self.nominal.repeat(n, 1)
-        self._targets = torch.zeros(n, self.config.substeps, joints, device=device)
-        self._new_share = torch.zeros(n, self.config.substeps, 1, device=device)
+        self.actuation = self._make_actuation()
         self._applied = torch.zeros(n, self.model.nv, device=device)
         self._reaction, self._reaction_point = torch.zeros(n, 3, device=device), torch.zeros(n, 3, device=device)
         self.robot = self._robot_state()
         self._record()
-        self._update_delay()
+
+    def _make_actuation(self) -> Actuation:
+        ranges, sampled = self.config.randomization, self.randomizer
+        backlash = sampled.backlash if ranges.backlash[1] > 0 else None
+        times = (self.config.engine.physics_dt, self.control_dt)
+        longest = ranges.actuator_delay[1]
+        return Actuation(sampled.actuator_delay, backlash, longest, self.nominal, self.engine.qpos_path, *times)
 
     def _record(self) -> None:
         n, device, qpos = self.num_worlds, self.device, self.engine.qpos_path
         path = {"qpos": qpos, "qvel": self.engine.qvel_path, "last": self.config.substeps}
         self._derive = MaskedLaunch(_derive, n, device, robot=self.robot, inverse_dt=1.0 / self.control_dt, **path)
-        held = {"previous_targets": self._previous_targets, "impulse": self.ball.events.paddle_impulse}
-        self._stand = MaskedLaunch(_stand, n, device, qpos=qpos, **held)
-        delay, share = self.randomizer.actuator_delay, self._new_share.squeeze(-1)
-        times = {"delay": delay, "physics_dt": self.config.engine.physics_dt}
+        self._forget_impulse = MaskedLaunch(_forget_impulse, n, device, impulse=self.ball.events.paddle_impulse)
         self._pose_bodies = self.bodies.poser(qpos, self.kinematics.paddle_path, self.ball)
-        self._update_delay = Launch(_spread_delay, n, device, new_share=share, **times)
         self._serve = Bound(self._record_serve, position=(n, 3), velocity=(n, 3), spin=(n, 3))
 
     def _record_serve(self, position: Tensor, velocity: Tensor, spin: Tensor) -> MaskedLaunch:
@@ -201,19 +188,16 @@ class Worlds(Stateful):
     def step(self, targets: Tensor) -> None:
         """One control step towards joint targets (N, J) rad; ``robot``, ``ball`` and ``ball.events`` are new after it.
 
-        Order: targets pass the actuator delay (a physics step in which the new target arrives gets the mean of both),
-        pushes and the ball's last impulse on the paddle act, the robot moves, then the ball flies the same interval
-        along the paths of paddle and body. Its impulse on the body does not act back.
+        Order: targets pass the actuator delay and the gears' play (:class:`pace.sim.actuation.Actuation`), pushes and
+        the ball's last impulse on the paddle act, the robot moves, then the ball flies the same interval along the
+        paths of paddle and body. Its impulse on the body does not act back.
         """
-        change = (targets - self._previous_targets).unsqueeze(1)
-        torch.mul(self._new_share, change, out=self._targets)
-        self._targets += self._previous_targets.unsqueeze(1)
-        self._previous_targets.copy_(targets)
+        delayed = self.actuation(targets)
         if self.randomizer.pushes_enabled:
             self.engine.add_velocity(self.randomizer.update_push())
         if self.config.engine.paddle_reaction:
             self._react()
-        self.engine.advance(self._targets, self._applied)
+        self.engine.advance(delayed, self._applied)
         self._observe()
         self._pose_bodies()
         self.ball.fly(self.kinematics.paddle_path)
@@ -239,11 +223,12 @@ class Worlds(Stateful):
     def reset_robot(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
         """Put the robots of ``mask`` (N,) bool into qpos (N, 7 + J), qvel (N, 6 + J); resample their parameters."""
         self.randomizer.sample(mask)
-        self._update_delay()
+        self.actuation.sample()
         self.engine.apply_params(mask)
         self.engine.reset(mask, qpos, qvel)
         self._observe(mask)
-        self._stand(mask)
+        self.actuation.hold(mask)
+        self._forget_impulse(mask)
 
     def serve(self, mask: Tensor, position: Tensor, velocity: Tensor, spin: Tensor) -> None:
         """Start the ball of the worlds of ``mask`` at position (N, 3) m, velocity (N, 3) m/s, spin (N, 3) rad/s.
@@ -275,12 +260,14 @@ class Worlds(Stateful):
     def _own_tensors(self) -> dict[str, Tensor]:
         ball = tensors_named(self.ball, ("position", "velocity", "spin", "in_view"))
         events = with_prefix("event", named_tensors(self.ball.events))
-        return ball | events | {"previous_targets": self._previous_targets}
+        held = self.actuation.held
+        older = {"older_targets": held[:, 1:]} if held.shape[1] > 1 else {}
+        return ball | events | older | {"previous_targets": held[:, 0]}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Load the result of :meth:`state_dict`."""
         self.randomizer.load_state_dict(under_prefix("drawn", state))
-        self._update_delay()
+        self.actuation.sample()
         everyone = torch.ones(self.num_worlds, dtype=torch.bool, device=self.device)
         self.engine.apply_params(everyone)
         self.engine.load_state_dict(under_prefix("engine", state))

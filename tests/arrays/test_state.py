@@ -37,13 +37,16 @@ STATE = {
     "statistics": "sums",
     "track": "age positions something_to_hit turned",
     "worlds": "in_view position previous_targets spin velocity",
-    "worlds.drawn": "actuator_delay until_push",
+    "worlds.drawn": "actuator_delay backlash paddle_error until_push",
     "worlds.drawn.ball": (
         "drag_coefficient magnus_coefficient mass paddle_drilling_loss paddle_friction paddle_restitution "
         "paddle_tangential_restitution table_drag table_friction table_lift table_restitution "
         "table_tangential_restitution"
     ),
-    "worlds.drawn.engine": "armature_scale effort_scale friction kd_scale kp_scale trunk_com trunk_mass",
+    "worlds.drawn.engine": (
+        "ankle_effort_scale armature_scale effort_scale friction joint_damping joint_friction kd_scale kp_scale "
+        "speed_scale trunk_com trunk_mass"
+    ),
     "worlds.engine": "body_contact foot_force joint_torque qpos qpos_path qvel qvel_path warmstart",
     "worlds.event": (
         "body body_time bounce_position edge edge_time floor floor_time hit_normal hit_offset hit_point hit_position "

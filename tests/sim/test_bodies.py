@@ -15,8 +15,8 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import root_scalar
 
+from pace.config.ball import TableConfig
 from pace.config.base import ConfigError
-from pace.config.sim import TableConfig
 from pace.config.training import load_train_config
 from pace.sim.ball.aero import GRAVITY
 from pace.sim.ball.ball import BallParams, BallSim

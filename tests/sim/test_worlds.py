@@ -31,20 +31,82 @@ def test_targets_arrive_after_the_actuator_delay() -> None:
     worlds = make_worlds(1)
     stand(worlds)
     worlds.randomizer.actuator_delay.fill_(0.007)
-    worlds._update_delay()
-    worlds.step(worlds.nominal + 0.1)
+    worlds.actuation.sample()
     # 7 ms into physics steps of 5 ms: nothing, 3 of 5 ms, all, all
-    share = (worlds._targets[0, :, 0] - worlds.nominal[0]) / 0.1
+    share = (worlds.actuation(worlds.nominal + 0.1)[0, :, 0] - worlds.nominal[0]) / 0.1
     torch.testing.assert_close(share, torch.tensor([0.0, 0.6, 1.0, 1.0]), atol=1e-5, rtol=0.0)
 
 
-def test_a_delay_longer_than_a_control_step_is_refused() -> None:
+def test_a_delay_of_more_than_a_control_step_is_the_targets_moved_in_time() -> None:
+    """The mean over each physics step of the targets' steps, 33 ms late, sampled finely."""
+    worlds = make_worlds(1, "randomization.actuator_delay=[0.033,0.033]")
+    stand(worlds)
+    given = torch.tensor([0.1, -0.2, 0.3, 0.05, 0.0])
+    played = torch.cat([worlds.actuation(worlds.nominal + value)[0, :, 0].clone() for value in given])
+    instants = (torch.arange(5 * 20 * 10) + 0.5) / 10.0 - 33.0  # ms, ten a millisecond
+    index = torch.div(instants, 20.0, rounding_mode="floor").long()
+    late = torch.where(index < 0, 0.0, given[index.clamp(min=0)]).view(20, 50).mean(1)
+    torch.testing.assert_close(played - worlds.nominal[0], late, atol=1e-6, rtol=0.0)
+
+
+def test_older_targets_are_saved_with_the_worlds() -> None:
+    worlds = make_worlds(2, "randomization.actuator_delay=[0.033,0.033]")
+    stand(worlds)
+    for value in (0.1, -0.2):
+        worlds.step(worlds.nominal.repeat(2, 1) + value)
+    saved = {name: tensor.clone() for name, tensor in worlds.state_dict().items()}
+    worlds.step(worlds.nominal.repeat(2, 1))
+    expected = worlds.engine.qpos_path.clone()
+    again = make_worlds(2, "randomization.actuator_delay=[0.033,0.033]")
+    again.load_state_dict(saved)
+    again.step(again.nominal.repeat(2, 1))
+    assert torch.equal(again.engine.qpos_path, expected)
+
+
+def test_a_delay_longer_than_four_control_steps_is_refused() -> None:
     with pytest.raises(ConfigError, match="actuator_delay"):
-        make_worlds(1, "randomization.actuator_delay=[0.0,0.03]")
+        make_worlds(1, "randomization.actuator_delay=[0.0,0.081]")
+
+
+def test_play_takes_its_half_from_the_way_of_the_motor() -> None:
+    worlds = make_worlds(3, "randomization.backlash=[0.02,0.02]")
+    stand(worlds)
+    offset = torch.tensor([[0.1], [-0.1], [0.008]])  # rad from where the joints are
+    played = worlds.actuation(worlds.nominal + offset)[:, -1]
+    expected = torch.tensor([[0.09], [-0.09], [0.0]])
+    torch.testing.assert_close(played - worlds.nominal, expected.expand_as(played), atol=1e-6, rtol=0.0)
+
+
+def test_the_paddle_is_tilted_and_shifted_in_a_direction_of_each_world() -> None:
+    """Its angle to the model's face and distance from the model's centre; all directions occur."""
+    count = 400
+    worlds = make_worlds(count, "randomization.paddle_tilt=[0.05,0.05]", "randomization.paddle_shift=[0.01,0.01]")
+    straight = make_worlds(count)
+    for each in (worlds, straight):
+        stand(each)
+    moved, normal = worlds.robot.paddle_position - straight.robot.paddle_position, worlds.robot.paddle_normal
+    torch.testing.assert_close(moved.norm(dim=1), torch.full((count,), 0.01), atol=1e-6, rtol=0.0)
+    cosine = (normal * straight.robot.paddle_normal).sum(1)
+    torch.testing.assert_close(cosine, torch.full((count,), 0.99875026), atol=1e-6, rtol=0.0)
+    # uniform over directions: the mean of a unit vector of M samples has a standard deviation of sqrt(1 / M)
+    assert moved.mean(0).norm() / 0.01 < 3.0 / count**0.5
+    assert (normal - straight.robot.paddle_normal).mean(0).norm() / 0.05 < 3.0 / count**0.5
+
+
+@pytest.mark.parametrize(
+    ("name", "low"),
+    [("speed_scale", 0.0), ("ankle_effort_scale", 0.0), ("joint_friction", -0.1), ("joint_damping", -1.0)],
+)
+def test_ranges_that_no_motor_or_joint_has_are_refused(name: str, low: float) -> None:
+    with pytest.raises(ConfigError, match=rf"randomization\.{name}"):
+        load_train_config([f"randomization.{name}=[{low},1.0]"])
 
 
 def test_randomised_parameters_stay_in_range_and_change_only_masked_worlds() -> None:
-    config = load_train_config(["randomization=moderate", "engine=native"])
+    ranges = {"speed_scale": (0.4, 1.8), "ankle_effort_scale": (0.7, 1.0), "joint_friction": (0.1, 0.5)}
+    ranges["joint_damping"] = (0.0, 0.3)
+    given = [f"randomization.{name}=[{low},{high}]" for name, (low, high) in ranges.items()]
+    config = load_train_config(["randomization=moderate", "engine=native", *given])
     worlds = Worlds(config, 64, "cpu")
     before = {name: value.clone() for name, value in worlds.randomizer.state_dict().items()}
     mask = torch.arange(64) % 2 == 0
@@ -54,6 +116,9 @@ def test_randomised_parameters_stay_in_range_and_change_only_masked_worlds() -> 
     after = worlds.randomizer.state_dict()
     assert after["ball.paddle_restitution"].min() >= low - 1e-6
     assert after["ball.paddle_restitution"].max() <= min(high, 1.0) + 1e-6
+    for name, (least, most) in ranges.items():
+        values = after[f"engine.{name}"]
+        assert least <= values.min() < values.max() <= most
     for name, value in after.items():
         assert torch.equal(value[~mask], before[name][~mask]), name
         low, high = value.min(), value.max()

@@ -148,7 +148,7 @@ def test_an_episode_may_begin_in_the_middle_of_a_serve() -> None:
 def test_a_fall_terminates_and_the_serve_counts_as_a_fall() -> None:
     env = make()
     qpos = env.worlds.engine.qpos_path[:, -1].clone()
-    qpos[2, 2] = 0.4
+    qpos[2, 2], qpos[2, 3:7] = 0.2, torch.tensor([0.7071068, 0.0, -0.7071068, 0.0])  # on its back, above the floor
     env.worlds.reset_robot(torch.arange(N) == 2, qpos, torch.zeros(N, 27))
     env.pop_statistics()
     env.advance(torch.zeros(N, 21))
@@ -312,7 +312,7 @@ def test_the_action_is_scaled_clipped_and_remembered(shared: TableTennisEnv) -> 
     shared.reset_worlds(torch.ones(N, dtype=torch.bool))
     action = 0.1 * torch.arange(21.0).repeat(N, 1)
     shared.advance(action)
-    torch.testing.assert_close(shared.worlds._previous_targets, shared.worlds.nominal + 0.25 * action)
+    torch.testing.assert_close(shared.worlds.actuation.held[:, 0], shared.worlds.nominal + 0.25 * action)
     frame = shared.policy_observation.view(N, 5, 90)[:, -1]
     torch.testing.assert_close(frame[:, shared.policy_layout["previous_action"]], action)
 

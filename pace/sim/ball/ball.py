@@ -16,8 +16,8 @@ from torch import Tensor
 
 from pace.arrays.launch import Bound, Launch, MaskedLaunch
 from pace.arrays.tensors import allocate
+from pace.config.ball import AirConfig, BallConfig, TableConfig
 from pace.config.base import ConfigError, config_dir, parse
-from pace.config.sim import AirConfig, BallConfig, TableConfig
 from pace.sim.ball.aero import AirTables
 from pace.sim.ball.air_tables import air_tables, air_tensors
 from pace.sim.ball.kernels import FORECAST_HORIZON, fly_step, forecast_flight, skip_flight

@@ -34,6 +34,10 @@ class EngineParams:
     kd_scale: Unit
     armature_scale: Unit
     effort_scale: Unit  # of the effort and, if the motors have a torque-speed line, of the stall torque
+    speed_scale: Unit  # of the no-load speed of that line, at the same stall torque
+    ankle_effort_scale: Unit  # times effort_scale, of the joints of the robot's group ``ankles``
+    joint_friction: Float  # N m added to the dry friction of all joints
+    joint_damping: Float  # N m s/rad, viscous friction added to all joints
 
     @classmethod
     def nominal(cls, model: mujoco.MjModel, num_worlds: int, device: torch.device) -> EngineParams:

@@ -219,6 +219,25 @@ def _effort(model):
     model.actuator_gainprm[:, 0] /= 0.2  # the resistance: the stall torque too
 
 
+def _speed(model):
+    model.actuator_gainprm[:, 7] *= 0.1  # the largest voltage, with a constant of 1 the no-load speed
+    model.actuator_gainprm[:, 0] *= 0.1  # the resistance: the same stall torque
+
+
+def _ankles(model):
+    ankles = [index for index, name in enumerate(JOINT_NAMES) if "Ankle" in name]
+    model.actuator_forcerange[ankles] *= 0.1
+    model.actuator_gainprm[ankles, 0] /= 0.1
+
+
+def _joint_friction(model):
+    model.dof_frictionloss[6:] += 1.5
+
+
+def _joint_damping(model):
+    model.dof_damping[6:] += 2.0
+
+
 CHANGES = {
     "friction": (0.3, _friction),
     "trunk_mass": (3.0, _trunk_mass),
@@ -227,6 +246,10 @@ CHANGES = {
     "kd_scale": (0.6, _kd),
     "armature_scale": (2.5, _armature),
     "effort_scale": (0.2, _effort),
+    "speed_scale": (0.1, _speed),
+    "ankle_effort_scale": (0.1, _ankles),
+    "joint_friction": (1.5, _joint_friction),
+    "joint_damping": (2.0, _joint_damping),
 }
 
 
@@ -257,13 +280,34 @@ def test_a_parameter_changes_its_world_alone_and_as_in_mujoco(fresh, name):
 
     reference = build_model(CONFIG.robot, CONFIG.engine, CONFIG.ball.table)
     by_hand(reference)
-    data = mujoco.MjData(reference)
-    mujoco.mj_resetDataKeyframe(reference, data, 0)
+    np.testing.assert_allclose(changed[1, -1], mujocos(reference, targets, shove), atol=5e-3)
+
+
+def mujocos(model, targets, shove):
+    """Velocities (27,) that MuJoCo computes for the motion of :func:`play`."""
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
     for target in targets:
-        for step in range(engine.substeps):
-            data.ctrl[:], data.qfrc_applied[:] = target[step], shove
-            mujoco.mj_step(reference, data)
-    np.testing.assert_allclose(changed[1, -1], data.qvel, atol=5e-3)
+        for step in target:
+            data.ctrl[:], data.qfrc_applied[:] = step, shove
+            mujoco.mj_step(model, data)
+    return data.qvel
+
+
+@pytest.mark.parametrize("name", ENGINES)
+def test_joints_without_friction_can_have_some(name):
+    """The engines set a row of the solver aside for each joint with friction."""
+    config = load_train_config(["robot=t1_paper", f"engine={name}", "engine.threads=1"])
+    reference = build_model(config.robot, config.engine, config.ball.table)
+    assert not reference.dof_frictionloss.any()
+    engine = make_engine(reference, config.engine, WORLDS, "cpu", 2)
+    engine.params.joint_friction[1] = 1.5
+    engine.apply_params(EVERY)
+    velocities, targets, shove = play(engine, reference)
+    np.testing.assert_allclose(velocities[0, -1], mujocos(reference, targets, shove), atol=5e-3)
+    _joint_friction(reference)
+    np.testing.assert_allclose(velocities[1, -1], mujocos(reference, targets, shove), atol=5e-3)
+    assert (velocities[1] - velocities[0]).abs().max() > 1e-2
 
 
 def test_parameters_can_be_taken_back(fresh):
