@@ -286,7 +286,10 @@ def disc_distance(offset: Vector, axis: Vector, radius: float, half_thickness: f
 
 
 def build_model(scene: Path, meta: Mapping[str, Any]) -> mujoco.MjModel:
-    """The scene with the motors of the training: gains, effort and, where the file has it, the torque-speed line."""
+    """The scene with the motors of the training: gains, effort and, where the file has it, the torque-speed line.
+
+    The robot's parts touch each other as in the training.
+    """
     robot = meta["config"]["robot"]["model"]  # in the folder of the scene, or a path
     file = scene.parent / robot if (scene.parent / robot).exists() else Path(robot)
     spec = mujoco.MjSpec.from_string(scene.read_text(), include={"robot.xml": file.read_bytes()})
@@ -302,6 +305,8 @@ def build_model(scene: Path, meta: Mapping[str, Any]) -> mujoco.MjModel:
                 motorconst=[1.0, 1.0], resistance=speed / stall, controller=[kp, 0, kd, 0, 0, speed], ctrlspec=position
             )
         actuator.forcerange = [-effort, effort]
+    for one, other in meta["config"]["robot"].get("self_collision", []):  # none in files of before
+        spec.add_pair(geomname1=one, geomname2=other)
     return spec.compile()
 
 
@@ -325,11 +330,12 @@ class Robot:
         self._targets: deque[Vector] = deque(maxlen=1)
 
     def _set_up(self, engine: Mapping[str, Any]) -> None:
-        """Solver and armature of the training."""
+        """Solver, armature (of each joint, or one number for all in files of before) and friction of the training."""
         model, meta = self.model, self.meta
         model.opt.timestep = PHYSICS_DT
         model.opt.iterations, model.opt.ls_iterations = engine["solver_iterations"], engine["line_search_iterations"]
         model.dof_armature[self._qvel] = meta["armature"]
+        model.dof_frictionloss[self._qvel] = meta.get("friction", 0.0)
 
     def _draw_steps(self, delay: list[float]) -> int:
         return round(self.noise * self._random.uniform(delay[0], delay[1]) / PHYSICS_DT)
@@ -507,8 +513,8 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--scene", type=Path, default=SCENE, help="MJCF of the table, beside that of the robot")
     options = parser.parse_args()
-    if options.serves < 1 or options.noise < 0.0:
-        parser.error("--serves must be at least 1, --noise not negative")
+    if options.serves < 1 or options.seed < 0 or not 0.0 <= options.noise < float("inf"):
+        parser.error("--serves must be at least 1, --seed and --noise not negative")
     try:
         controller = Controller(options.policy)
     except (ValueError, *UNREADABLE) as error:

@@ -1,8 +1,6 @@
-"""The GPU and the cores of this machine."""
+"""The devices of this machine: its CPU and its GPUs."""
 
 from __future__ import annotations
-
-import os
 
 import torch
 
@@ -28,13 +26,3 @@ def resolve_device(device: str | torch.device) -> torch.device:
             raise ConfigError(f"device {device} is not there: torch sees {count} GPU(s); use device=cpu")
         return torch.device("cuda", resolved.index or 0)
     return torch.device("cpu")
-
-
-def usable_cores() -> int:
-    """Cores that this process may use: a job's share of a machine if the system tells, else all of them."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def threads_of(size: int) -> int:
-    """Threads for each of ``size`` processes on this machine."""
-    return max(1, usable_cores() // size)

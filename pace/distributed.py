@@ -22,7 +22,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from pace.devices import threads_of, usable_cores
+from pace.cores import threads_of, usable_cores
 
 T = TypeVar("T")
 

@@ -28,6 +28,7 @@ TINY = {
         "warmup_serves=0",
         "physics_dt=0.01",
         "engine.threads=1",
+        "first_ball=[]",
         "progress=false",
     ),
     "export": ("check_worlds=2", "check_steps=3"),

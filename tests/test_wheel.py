@@ -87,6 +87,6 @@ def test_it_trains_and_evaluates_in_an_empty_folder(installed: Path, empty: Path
     run(installed / "pace", "train", "out=run", *SMALL, folder=empty)
     assert (empty / "run" / "metrics.csv").is_file()
     table = ("rows=[mixed]", "serves=2", "num_worlds=2", "warmup_serves=0", "physics_dt=0.01", "progress=false")
-    run(installed / "pace", "evaluate", "run", "out=table", "engine.threads=1", *table, folder=empty)
+    run(installed / "pace", "evaluate", "run", "out=table", "engine.threads=1", "first_ball=[]", *table, folder=empty)
     assert (empty / "table" / "evaluation.json").is_file()
     assert {path.name for path in empty.iterdir()} == {"run", "table"}

@@ -12,7 +12,7 @@ import torch
 from pace.bench.training import BenchError
 from pace.config import plugins
 from pace.config.commands import BenchConfig
-from pace.devices import threads_of
+from pace.cores import threads_of
 from pace.distributed import ProcessGroup
 from pace.predictor.network import make_predictor
 from pace.predictor.priors import resolve_priors

@@ -5,7 +5,6 @@ All figures are measured in one run; those to be compared are measured in turn.
 
 from __future__ import annotations
 
-import os
 import time
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from omegaconf import DictConfig
 from pace.bench import physics, report, training, update
 from pace.config.base import parse
 from pace.config.commands import BenchConfig
+from pace.cores import usable_cores
 from pace.devices import resolve_device
 from pace.runs.run_folder import make_out, versions
 
@@ -39,7 +39,7 @@ def measure(config: BenchConfig, overrides: list[str], path: Path) -> dict[str, 
     device = resolve_device(config.device)
     machine = report.machine(device)
     if machine["load"] > BUSY_LOAD:
-        print(f"the machine is busy (load {machine['load']:.1f} on {os.cpu_count()} cores): figures will be low")
+        print(f"the machine is busy (load {machine['load']:.1f} on {usable_cores()} cores): figures will be low")
     parts = {
         "physics": lambda: physics.native_rates(config),
         "mjwarp": lambda: physics.mjwarp_rates(config, device),

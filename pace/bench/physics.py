@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 
@@ -16,6 +15,7 @@ from torch import Tensor
 from pace.bench.environment import EnvironmentLoop, EnvironmentProcesses
 from pace.bench.timing import median_seconds
 from pace.config.commands import BenchConfig
+from pace.cores import usable_cores
 from pace.distributed import suitable_size
 
 
@@ -28,7 +28,7 @@ class RawMujoco:
 
     def __init__(self, model: mujoco.MjModel, physics_steps: int) -> None:
         self.model, self.physics_steps = model, physics_steps
-        self.threads = os.cpu_count() or 1
+        self.threads = usable_cores()
         self._data = [mujoco.MjData(model) for _ in range(self.threads)]
         self._pool = ThreadPoolExecutor(self.threads)
         self.qpos = self.qvel = self.ctrl = np.zeros((0, 0))

@@ -11,6 +11,8 @@ from typing import Any
 
 import torch
 
+from pace.cores import usable_cores
+
 FILE = "bench.json"
 
 # name: title, unit, and the figures that it is compared with
@@ -72,7 +74,7 @@ def machine(device: torch.device) -> dict[str, Any]:
     gpu = torch.cuda.get_device_name(device) if device.type == "cuda" else None
     return {
         "cpu": _cpu_name(),
-        "cores": os.cpu_count(),
+        "cores": usable_cores(),
         "gpu": gpu,
         "torch_threads": torch.get_num_threads(),
         "load": os.getloadavg()[0],

@@ -21,6 +21,7 @@ from pace.command.table import COMMANDS, Command
 from pace.config import plugins
 from pace.config.base import ConfigError, also_from, compose, config_dir, meant
 from pace.config.names import check_choice, split_override
+from pace.cores import core_set, usable_cores
 
 EXIT_USAGE = 2
 EXIT_FAILED = 1
@@ -40,12 +41,20 @@ def run_command(name: str) -> int:
         sys.argv[1:] = prepare(name, sys.argv[1:])
     except ConfigError as error:
         return complain(str(error), EXIT_USAGE)
+    _limit_threads()
     try:
         return _run_hydra(COMMANDS[name])
     except (HydraException, OmegaConfBaseException) as error:
         return complain(explain(name, sys.argv[1:], error), EXIT_USAGE)
     except KeyboardInterrupt:
         return complain("interrupted", EXIT_INTERRUPTED)
+
+
+def _limit_threads() -> None:
+    """torch and BLAS would take a thread for each core that they see; their workers inherit the limit."""
+    cores = usable_cores()
+    if cores < len(core_set()):
+        os.environ.setdefault("OMP_NUM_THREADS", str(cores))
 
 
 def _topic(arguments: Sequence[str]) -> str:
@@ -67,6 +76,9 @@ def _run_hydra(command: Command) -> int:
             if not command.extra or (error.name or "").startswith("pace"):
                 raise
             status = complain(f"{error}: pip install 'pace-table-tennis[{command.extra}]'", EXIT_FAILED)
+            return
+        except ConfigError as error:
+            status = complain(str(error), EXIT_USAGE)
             return
         try:
             if "plugins" in config:

@@ -213,7 +213,7 @@ COMMANDS = {
         summary="measurements of engines, step sizes, motors, predictors, ... (extra dev)",
         usage="STUDY [STUDY ...] [key=value ...]",
         about="Prints the tables of the documentation and draws their figures. STUDY: reaction, parity, steps, solver, "
-        "motors, predictor, posture, adaptation, senses, rounding, recipe, learning, architecture, or all.",
+        "motors, predictor, adaptation, senses, rounding, recipe, learning, architecture, or all.",
         examples=("parity worlds=16", "steps solver run=pretrained/pace", "predictor serves=512 cases=[rubber]"),
         rest="studies",
     ),

@@ -17,6 +17,8 @@ from typing import Any, TypeVar
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigKeyError, OmegaConfBaseException
 
+from pace.config.limits import first_outside
+
 Range = list[float]
 T = TypeVar("T")
 
@@ -80,9 +82,13 @@ def parse(config: DictConfig | dict[str, Any], schema: type[T]) -> T:
     try:
         OmegaConf.resolve(plain)
         merged = OmegaConf.merge(OmegaConf.structured(schema), plain)
-        return OmegaConf.to_object(merged)  # type: ignore[return-value]
+        parsed = OmegaConf.to_object(merged)
     except OmegaConfBaseException as error:
         raise ConfigError(f"configuration key '{error.full_key or '?'}': {_reason(error)}") from error
+    wrong = first_outside(parsed)
+    if wrong is not None:
+        raise ConfigError(wrong)
+    return parsed  # type: ignore[return-value]
 
 
 def _reason(error: OmegaConfBaseException) -> str:

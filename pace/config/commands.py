@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field
 
 from pace.config.base import require
+from pace.config.quality import QualityConfig, check_first_ball
 from pace.config.training import TrainConfig
 
 
@@ -92,6 +93,11 @@ class EvaluateConfig:
     sweep_rows: list[str]
     variations: VariationConfig
     reality: str | None  # a file of configs/realities/
+    first_ball: list[float]  # s that robots stand ready before their first ball
+    first_ball_worlds: int  # robots for each of these times
+    first_ball_serve: str  # a name of configs/serve/
+    first_ball_kind: str  # what the ball does until then: a key of serve.pause_ball
+    quality: QualityConfig
     paper: dict[str, PaperRow]
     plugins: list[str] = field(default_factory=list)  # modules that add what the saved task needs
 
@@ -106,6 +112,7 @@ class EvaluateConfig:
         given = self.num_worlds is None or self.num_worlds >= 1
         require(given, f"num_worlds must be null or at least 1, got {self.num_worlds}")
         require(self.warmup_serves >= 0, f"warmup_serves must not be negative, got {self.warmup_serves}")
+        check_first_ball(self.first_ball, self.first_ball_worlds, self.first_ball_kind)
 
     def worlds_for(self, serves: int) -> int:
         """Worlds that play a row of ``serves``."""

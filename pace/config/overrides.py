@@ -17,8 +17,8 @@ from pace.config.training import TrainConfig
 
 #: Groups of configs/ whose choice may change for a saved policy; networks and observations may not.
 TASK_GROUPS = ("ball", "serve", "reset", "randomization", "sensing", "reward", "robot")
-
-
+#: Of the engine, what a robot needs: limits of the solver, which ends at convergence. They come with its choice.
+SOLVER = ("solver_iterations", "line_search_iterations")
 #: Parts of a saved task in which single values may change.
 TASK_VALUES = ("landing_target",)
 CHANGEABLE = (*TASK_GROUPS, "engine", *TASK_VALUES)
@@ -48,7 +48,8 @@ def override_task(config: TrainConfig, overrides: Sequence[str]) -> TrainConfig:
     """A saved configuration with parts of its task changed; ``config`` is not changed.
 
     An override is a choice of a group, ``ball=paper`` (of :data:`TASK_GROUPS`; ``engine=native`` keeps the saved
-    solver), or a value, ``engine.physics_dt=0.002``. Choices are applied before values, later ones win.
+    solver, ``robot=t1`` brings its limits), or a value, ``engine.physics_dt=0.002``. Choices are applied before
+    values, later ones win.
 
     Errors: :class:`ConfigError` for anything else, and for unknown keys and values.
     """
@@ -67,8 +68,7 @@ def override_task(config: TrainConfig, overrides: Sequence[str]) -> TrainConfig:
             values.append(override)
         else:
             raise ConfigError(f"'{key}' cannot change for a saved policy; {', '.join(TASK_GROUPS)} and engine can")
-    merged: dict[str, Any] = to_dict(config)
-    merged |= _choose(choices)
+    merged: dict[str, Any] = _choose(to_dict(config), choices)
     try:
         changed = OmegaConf.merge(OmegaConf.create(merged), OmegaConf.from_dotlist(values))
     except OmegaConfBaseException as error:
@@ -81,14 +81,17 @@ def without_reward(config: TrainConfig) -> TrainConfig:
     return replace(config, reward=replace(config.reward, terms={}))
 
 
-def _choose(choices: Mapping[str, str]) -> dict[str, Any]:
-    """The choice of each group, from configs/."""
+def _choose(saved: Mapping[str, Any], choices: Mapping[str, str]) -> dict[str, Any]:
+    """``saved`` with the choice of each group, from configs/."""
     if not choices:
-        return {}
+        return dict(saved)
     for group, choice in choices.items():
         check_choice(group, choice)
     try:
         fresh = compose("train", [f"{group}={choice}" for group, choice in choices.items()])
     except HydraException as error:
         raise ConfigError(" ".join(str(error).split())) from error
-    return {group: fresh[group] for group in choices}
+    chosen = {**saved, **{group: fresh[group] for group in choices}}
+    if "robot" in choices:
+        chosen["engine"] = {**saved["engine"], **{name: fresh["engine"][name] for name in SOLVER}}
+    return chosen

@@ -16,7 +16,6 @@ RENAMED_CHOICES: dict[str, dict[str, str]] = {
     "predictor": {"pace": "last_five"},
     "bench": {"full": "all"},
     "experiment": {
-        "campaign": "generalist",
         "full": "ablation/baseline",
         **{name: f"ablation/{name}" for name in ABLATIONS},
     },

@@ -1,4 +1,4 @@
-"""Configuration of the physics worlds: robot, ball, engine, randomization, sensing."""
+"""Configuration of the physics worlds: robot, engine, randomization, sensing."""
 
 from __future__ import annotations
 
@@ -6,18 +6,27 @@ import math
 from dataclasses import dataclass, field, fields
 
 from pace.config import plugins
+from pace.config.ball import BallConfig
 from pace.config.base import Range, check_range, require
 
 
 @dataclass
 class JointGroup:
-    """Gains and limits of the joints whose name contains one of ``match``."""
+    """Gains, limits, inertia and friction of the joints whose name contains one of ``match``."""
 
     match: list[str]
     kp: float  # N m / rad
     kd: float  # N m s / rad
     effort: float  # N m
     max_speed: float = 0.0  # rad/s, at which the motor has no torque; needed if robot.stall_ratio is on
+    armature: float | None = None  # kg m^2; None: robot.armature
+    friction: float = 0.0  # N m, dry
+
+    def __post_init__(self) -> None:
+        for name in ("armature", "friction"):
+            value = getattr(self, name)
+            known = value is None or 0 <= value < math.inf
+            require(known, f"robot.joint_groups {self.match}: {name} must be finite and not negative, got {value}")
 
 
 @dataclass
@@ -34,13 +43,24 @@ class RobotConfig:
     control_dt: float  # s
     action_scale: float  # rad per unit of action
     action_clip: float  # largest |action|
-    armature: float  # kg m^2
+    armature: float  # kg m^2, of joints whose group has none
     base_height: float  # m, base above the floor at reset
     joint_groups: list[JointGroup]  # the first match of a joint counts
     nominal_pose: dict[str, float]  # rad; joints not named are at 0
     stall_ratio: float = 0.0  # stall torque over effort; 0: full effort at any speed (earlier policies)
+    # pairs of geoms that touch each other, besides those that the MJCF lists; a robot that has some counts as contacts
+    # of a body those with floor and table alone
+    self_collision: list[list[str]] = field(default_factory=list)
+    reset_limits: dict[str, Range] = field(default_factory=dict)  # rad, within which a joint starts, besides its range
+    # bodies or geoms of the hand that holds the paddle, below the wrist: the ball may touch them as it may the paddle
+    paddle_hand: list[str] = field(default_factory=list)
+    free_hand: str = ""  # body of the hand without the paddle, which must not touch the playing surface; "": none
 
     def __post_init__(self) -> None:
+        for pair in self.self_collision:
+            require(len(set(pair)) == len(pair) == 2, f"robot.self_collision needs pairs of two geoms, got {pair}")
+        for joint, limits in self.reset_limits.items():
+            check_range(f"robot.reset_limits.{joint}", limits)
         require(self.control_dt > 0, "robot.control_dt must be positive")
         require(len(self.foot_sites) == 2, f"robot.foot_sites must name a left and a right sole, got {self.foot_sites}")
         known = self.stall_ratio == 0 or 1 <= self.stall_ratio < math.inf
@@ -48,115 +68,6 @@ class RobotConfig:
         slow = [group.match for group in self.joint_groups if group.max_speed <= 0]
         require(not (self.stall_ratio and slow), f"robot.stall_ratio needs the max_speed of the joint groups {slow}")
         require(self.action_clip > 0, "robot.action_clip must be positive")
-
-
-@dataclass
-class TableConfig:
-    """Table, net, floor and paddle for the ball's collisions; world frame, origin under the table's centre."""
-
-    length: float  # m, along x
-    width: float  # m, along y
-    height: float  # m, top above the floor
-    thickness: float  # m
-    net_height: float  # m above the top
-    net_overhang: float  # m past each side line
-    paddle_radius: float  # m
-    paddle_half_thickness: float  # m, blade and rubber
-    floor_restitution: float
-    floor_friction: float
-    net_restitution: float
-    net_friction: float
-
-
-@dataclass
-class DragRow:
-    """C_d at one speed: linear in the spin ratio S = r |omega| / |v| between the knots, held beyond them."""
-
-    speed: float  # m/s
-    ratio: list[float]
-    coefficient: list[float]
-
-    def __post_init__(self) -> None:
-        knots = f"ball.air.drag at {self.speed} m/s"
-        require(
-            len(self.ratio) == len(self.coefficient) > 1, f"{knots}: needs as many ratios as coefficients, 2 or more"
-        )
-        require(self.ratio == sorted(set(self.ratio)), f"{knots}: ratios must grow, got {self.ratio}")
-        require(min(self.coefficient) >= 0, f"{knots}: a coefficient must not be negative, got {self.coefficient}")
-
-
-@dataclass
-class LiftRow:
-    """C_M at one speed: slope omega + offset up to the spin ``bend``, above it a parabola."""
-
-    speed: float  # m/s
-    slope: float  # s/rad
-    offset: float
-    bend: float  # rad/s
-    quadratic: float  # s^2/rad^2
-    linear: float  # s/rad
-    constant: float
-
-
-@dataclass
-class AirConfig:
-    """Measured coefficients of drag and lift, by rows of growing speed; linear in speed between the rows."""
-
-    drag: list[DragRow]
-    lift: list[LiftRow]
-
-    def __post_init__(self) -> None:
-        for name in ("drag", "lift"):
-            speeds = [row.speed for row in getattr(self, name)]
-            require(len(speeds) >= 2, f"ball.air.{name} needs at least two rows")
-            require(speeds == sorted(set(speeds)), f"ball.air.{name}: the speeds of the rows must grow, got {speeds}")
-        knots = {len(row.ratio) for row in self.drag}
-        require(len(knots) == 1, f"ball.air.drag: every row needs the same number of knots, got {sorted(knots)}")
-
-
-@dataclass
-class BallConfig:
-    """Ball, air and contacts (:class:`pace.sim.ball.BallParams`).
-
-    The defaults are those of policies saved before rubber sprang back: constant coefficients of the air, no springing.
-    """
-
-    name: str
-    mass: float  # kg
-    radius: float  # m
-    air_density: float  # kg / m^3
-    drag_coefficient: float
-    magnus_coefficient: float
-    table_restitution: float
-    table_restitution_slope: float  # s / m
-    table_friction: float
-    paddle_restitution: float
-    paddle_restitution_slope: float  # s / m
-    paddle_friction: float
-    table: TableConfig
-    min_restitution: float = 0.0
-    table_drag: float = 0.0  # share of the measured C_d in air.drag, added to drag_coefficient
-    table_lift: float = 0.0  # share of the measured C_M in air.lift
-    table_tangential_restitution: float = 0.0  # share of the slip that is reversed; 0: the ball rolls
-    paddle_tangential_restitution: float = 0.0
-    paddle_tangential_restitution_slope: float = 0.0  # s / m, times the speed of the slip
-    paddle_drilling_loss: float = 0.0  # share of the spin about the paddle's normal that a hit takes
-    air: AirConfig | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("table_drag", "table_lift", "paddle_tangential_restitution_slope"):
-            require(getattr(self, name) >= 0, f"ball.{name} must not be negative, got {getattr(self, name)}")
-        for name in ("table_tangential_restitution", "paddle_tangential_restitution"):
-            value = getattr(self, name)
-            require(-1 <= value <= 1, f"ball.{name} must lie in [-1, 1], got {value}: more would create energy")
-        loss = self.paddle_drilling_loss
-        require(0 <= loss <= 1, f"ball.paddle_drilling_loss must lie in [0, 1], got {loss}")
-        needed = self.air is not None or self.table_drag == self.table_lift == 0
-        require(needed, "ball.table_drag and ball.table_lift need the tables of ball.air (configs/ball/_air.yaml)")
-        for name in ("mass", "radius"):
-            require(getattr(self, name) > 0, f"ball.{name} must be positive")
-        for name in ("table_restitution", "paddle_restitution"):
-            require(0 <= getattr(self, name) <= 1, f"ball.{name} must lie in [0, 1]")
 
 
 @dataclass
@@ -188,14 +99,21 @@ class RandomizationConfig:
     backlash: Range = field(default_factory=lambda: [0.0, 0.0])  # rad, play of every joint's gear
     paddle_tilt: Range = field(default_factory=lambda: [0.0, 0.0])  # rad, of the face, in a random direction
     paddle_shift: Range = field(default_factory=lambda: [0.0, 0.0])  # m, of its centre, in a random direction
+    speed_scale: Range = field(default_factory=lambda: [1.0, 1.0])  # of max_speed; of no effect without stall_ratio
+    ankle_effort_scale: Range = field(default_factory=lambda: [1.0, 1.0])  # times effort_scale, of the group ankles
+    joint_friction: Range = field(default_factory=lambda: [0.0, 0.0])  # N m, dry, added in every joint
+    joint_damping: Range = field(default_factory=lambda: [0.0, 0.0])  # N m s/rad, added in every joint
 
     def __post_init__(self) -> None:
         for f in fields(self):
             if f.name != "name":
                 check_range(f"randomization.{f.name}", getattr(self, f.name))
-        require(self.effort_scale[0] > 0, "randomization.effort_scale must be positive")
         for name in ("actuator_delay", "backlash", "paddle_tilt", "paddle_shift"):
             check_range(f"randomization.{name}", getattr(self, name), lowest=0.0)
+        for name in ("effort_scale", "speed_scale", "ankle_effort_scale"):
+            require(getattr(self, name)[0] > 0, f"randomization.{name} must be positive")
+        for name in ("joint_friction", "joint_damping"):
+            require(getattr(self, name)[0] >= 0, f"randomization.{name} must not be negative")
 
 
 @dataclass
@@ -244,6 +162,8 @@ class SensingConfig:
     moved: float = 0.03
     # m/s; a ball sensed farther from its last position than this allows is another ball (smashes: below 20 m/s)
     fastest_ball: float = 25.0
+    # s; a ball without a frame is extrapolated for so long, and one that is seen again after it counts as another
+    longest_gap: float = 0.1
     mocap: MocapConfig = field(default_factory=MocapConfig)
 
     def __post_init__(self) -> None:
@@ -251,6 +171,7 @@ class SensingConfig:
         check_range("sensing.noise_scale", self.noise_scale, lowest=0.0)
         require(self.moved >= 0, f"sensing.moved must not be negative, got {self.moved}")
         require(self.fastest_ball > 0, f"sensing.fastest_ball must be positive, got {self.fastest_ball}")
+        require(self.longest_gap >= 0, f"sensing.longest_gap must not be negative, got {self.longest_gap}")
 
 
 @dataclass

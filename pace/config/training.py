@@ -145,7 +145,8 @@ def load_train_config(overrides: list[str] | None = None) -> TrainConfig:
 
 
 # Keys that a resumed run may change; all others are as saved, or the run would not resume exactly.
-# Another number of processes means new worlds.
+# Another number of processes means new worlds; with out=, a new run folder goes on from the checkpoint.
 RESUME_KEYS = (
-    "resume", "samples", "minutes", "checkpoint_minutes", "tensorboard", "progress", "device", "processes", "plugins"
+    "resume", "samples", "minutes", "checkpoint_minutes", "tensorboard", "progress", "device", "processes", "plugins",
+    "out",
 )  # fmt: skip

@@ -32,6 +32,15 @@ NEW_BALL_SAMPLES = (
     "paddle_drilling_loss",
 )
 
+#: Parameters of the robot that are sampled since format 4, and the value that changes nothing.
+NEW_ROBOT_SAMPLES = {"speed_scale": 1.0, "ankle_effort_scale": 1.0, "joint_friction": 0.0, "joint_damping": 0.0}
+
+#: Hands of the robots of this package, by their MJCF; new keys of the robot in format 4.
+HANDS: dict[str, dict[str, Any]] = {
+    "t1_paddle.xml": {"paddle_hand": [], "free_hand": "left_hand_link"},
+    "t1_29dof_paddle.xml": {"paddle_hand": ["right_hand_link"], "free_hand": "AL4"},
+}
+
 Saved = dict[str, Any]
 Upgrade = tuple[int, Callable[[Saved], None]]
 
@@ -131,6 +140,12 @@ def sample_play_and_mount(state: Saved) -> None:
         env.setdefault("worlds.drawn.paddle_error", position.new_zeros(len(position), 5))
 
 
+def count_seeds_from_zero(config: Saved) -> None:
+    """A seed is at least 0 and below 2^32; which numbers it gives to new worlds is of no meaning."""
+    if isinstance(config.get("seed"), int):
+        config["seed"] %= 2**32
+
+
 def describe_the_frames(state: Saved) -> None:
     """The sensors' delay line gets columns: 1 in a new ball's first frame, of which it held none with an older ball,
     and 1 with the ball in view, as it always was; the sensed ball has an age (saved tasks had steps of 0.02 s).
@@ -145,6 +160,39 @@ def describe_the_frames(state: Saved) -> None:
         env["sensing.ball_age"] = env["track.age"] = 0.02 * env["sensing._delay"]
         env["sensing.ball_new"] = over.new_ones(over.shape)
         env["env.predictor_valid"] = env["game.target.something_to_hit"] & env["track.something_to_hit"]
+
+
+def add_what_motors_and_joints_sample(state: Saved) -> None:
+    """A world's samples of ``engine`` that did not exist."""
+    for env in _environments(state):
+        rows = env["worlds.drawn.engine.effort_scale"]
+        for name, value in NEW_ROBOT_SAMPLES.items():
+            env.setdefault(f"worlds.drawn.engine.{name}", rows.new_full(rows.shape, value))
+
+
+def name_the_papers_robot(config: Saved) -> None:
+    """``t1`` was what ``t1_paper`` is now, in the robot and in the stages of the curriculum."""
+    robot = _entry(config, "robot")
+    if robot.get("name") == "t1":
+        robot["name"] = "t1_paper"
+    change_stages(config, lambda text: ["robot=t1_paper" if text == "robot=t1" else text])
+
+
+def name_the_hands(config: Saved) -> None:
+    """The rule that the free hand must not touch the table holds for policies that were trained before it."""
+    robot = _entry(config, "robot")
+    for key, hand in HANDS.get(robot.get("model", ""), {}).items():
+        robot.setdefault(key, hand)
+
+
+def add_the_body(state: Saved) -> None:
+    """The robot's body was no surface, and two outcomes were not counted: they are the last of the statistics."""
+    for env in _environments(state):
+        counts, sums = env["worlds.event.edge"], env["statistics.sums"]
+        env.setdefault("worlds.event.body", counts.new_zeros(counts.shape))
+        env.setdefault("worlds.event.body_time", env["worlds.event.edge_time"].new_full(counts.shape, float("inf")))
+        env["statistics.sums"] = sums.new_zeros(len(sums) + 2)
+        env["statistics.sums"][:-2] = sums
 
 
 def _environments(state: Saved) -> Iterator[Saved]:
@@ -169,6 +217,9 @@ CONFIG_UPGRADES: list[Upgrade] = [
     (2, store_the_predictors_priors),
     (3, name_the_first_reading),
     (3, split_the_spin),
+    (4, name_the_papers_robot),
+    (4, name_the_hands),
+    (4, count_seeds_from_zero),
 ]
 #: (format that it makes, function of the training state: ``ppo``, ``regression`` and ``processes``, each of them with
 #: ``env`` and ``random``). Tensors are in their places.
@@ -177,6 +228,8 @@ STATE_UPGRADES: list[Upgrade] = [
     (3, add_the_pauses),
     (3, describe_the_frames),
     (4, sample_play_and_mount),
+    (4, add_what_motors_and_joints_sample),
+    (4, add_the_body),
 ]
 
 

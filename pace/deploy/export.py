@@ -34,7 +34,7 @@ from pace.deploy.graph import (
 from pace.onboard.estimate import columns
 from pace.rl.policies import TaskPolicy, load_policy
 from pace.runs.run_folder import VERSIONS, make_out, versions
-from pace.sim.robot import build_model, joint_gains, motor_lines, nominal_pose
+from pace.sim.robot import build_model, joint_armature, joint_friction, joint_gains, motor_lines, nominal_pose
 from pace.sim.robot_spec import RobotSpec
 from pace.task.observations import POLICY, layout
 
@@ -164,7 +164,8 @@ def metadata(
         "effort": effort,
         "max_speed": max_speed,  # rad/s: the drive falls from the stall torque (N m) at rest to zero there; null: none
         "stall_torque": stall_torque,
-        "armature": config.robot.armature,
+        "armature": joint_armature(config.robot).tolist(),
+        "friction": joint_friction(config.robot).tolist(),
         "action_scale": config.robot.action_scale,
         "action_clip": config.robot.action_clip,
         "control_dt": config.robot.control_dt,

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from pace.config.renamed import current_override
-from pace.evaluation.report import markdown_table
+from pace.evaluation.quality_report import more_tables
+from pace.evaluation.text import markdown_table
 from pace.rl.policies import saved_config
 from pace.runs.checkpoint import load_checkpoint
 
@@ -51,13 +52,14 @@ def _facts(folder: Path, versions: Mapping[str, Any]) -> str:
 
 def _evaluation(folder: Path, found: Mapping[str, Any]) -> str:
     overrides = [current_override(text) for text in found["overrides"] if not text.startswith(MACHINE)]
-    fixed = [f"{key}={found[key]}" for key in ("physics_dt", "num_worlds", "warmup_serves", "seed")]
+    fixed = [f"task={found.get('task_name', 'own')}"]  # files of before there was a choice: the policy's own
+    fixed += [f"{key}={found[key]}" for key in ("physics_dt", "num_worlds", "warmup_serves", "seed")]
     serves = f"serves={min(row['serves'] for row in found['rows'])}"
     command = " ".join(["python -m pace.evaluation", f"pretrained/{folder.name}", *fixed, serves, *overrides])
     table = markdown_table(
         ("serves", "number", "hit %", "success %", "falls per 1,000"), [_row(row) for row in found["rows"]]
     )
-    return f"## Evaluation\n\n`{command}`\n\n{table}"
+    return "\n\n".join(["## Evaluation", f"`{command}`", table, *more_tables(found, markdown_table)])
 
 
 def _sweep(found: Mapping[str, Any]) -> str:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +19,10 @@ from pace.config.overrides import override_task
 from pace.config.training import TrainConfig
 from pace.devices import resolve_device
 from pace.evaluation.figures import write_figures
+from pace.evaluation.first_ball import first_ball_row
+from pace.evaluation.quality import QualityRecorder
 from pace.evaluation.report import describe, tables, write_report
-from pace.evaluation.serves import Row, evaluate_row
+from pace.evaluation.serves import MakeRecorder, OnCount, Row, evaluate_row
 from pace.evaluation.sweep import (
     Cell,
     Tables,
@@ -33,7 +37,7 @@ from pace.evaluation.sweep import (
 from pace.evaluation.task import policy_on, task_line
 from pace.rl.policies import TaskPolicy, built_in_policy, load_policy
 from pace.runs.progress import SECONDS_PER_LINE, clock
-from pace.runs.run_folder import default_folder, make_out, versions
+from pace.runs.run_folder import make_out, versions
 
 TASK_PARTS = ("robot", "ball", "engine", "randomization", "sensing")  # parts of the task in the report
 
@@ -45,13 +49,12 @@ def evaluate_from_config(composed: DictConfig) -> None:
     policy = policy_on(config.task, saved)
     overrides = [f"engine.physics_dt={config.physics_dt}", *config.overrides]
     context = circumstances(config, policy, overrides)
-    folder = Path(config.out) if config.out else default_folder("evaluation")
     task = override_task(policy.config, overrides)
     told = task_line(config.task, saved.config, task)
     print(f"policy {policy.source}\n{told}\n{describe(context)}", flush=True)
     cells = [plan_cell(change, config, policy, overrides, context["versions"]) for change in changes(config, task)]
+    folder = make_out(config.out, "evaluation")
     finished = finished_cells(folder, cells) if cells else {}
-    make_out(str(folder), "evaluation")
     if config.rows:
         evaluate_table(config, policy, task, overrides, folder, context)
     if cells:
@@ -73,12 +76,26 @@ def evaluate_table(
 ) -> None:
     """Play the rows that ``config`` names, print their table and write it with its figures into ``folder``."""
     worlds = config.worlds_for(config.serves)
+    record = partial(QualityRecorder, config=config.quality)
     rows = [
-        _with_bar(config, policy, name, name, config.serves, worlds, config.device, overrides) for name in config.rows
+        _with_bar(config, policy, name, name, config.serves, worlds, config.device, overrides, record)
+        for name in config.rows
     ]
-    print(f"\n{tables(rows, config.paper)}\n")
-    files, target = write_report(folder, rows, config.paper, context), (task.landing_target[0], task.landing_target[1])
-    _announce([*files, *write_figures(folder, rows, task.ball.table, target)])
+    first = first_balls(config, policy, overrides)
+    print(f"\n{tables(rows, config.paper, first_ball=first)}\n")
+    files = write_report(folder, rows, config.paper, context, first)
+    target = (task.landing_target[0], task.landing_target[1])
+    _announce([*files, *write_figures(folder, rows, task.ball.table, target, config.warmup_serves)])
+
+
+def first_balls(config: EvaluateConfig, policy: TaskPolicy, overrides: Sequence[str]) -> dict[str, Any]:
+    """The first ball after standing ready for each time of ``config``; the row of each."""
+    serve, kind, worlds = config.first_ball_serve, config.first_ball_kind, config.first_ball_worlds
+    rows = []
+    for wait in config.first_ball:
+        with _bar(config, f"first ball after {wait:g} s", worlds) as show:
+            rows.append(first_ball_row(policy, wait, worlds, serve, kind, config.device, config.seed, overrides, show))
+    return {"serve": serve, "ball": kind, "rows": rows}
 
 
 def choose_policy(config: EvaluateConfig) -> TaskPolicy:
@@ -96,7 +113,8 @@ def circumstances(config: EvaluateConfig, policy: TaskPolicy, overrides: Sequenc
     Errors: :class:`pace.config.ConfigError` for an unknown serve range and a physics step that does not divide the
     control step, before hours of simulation.
     """
-    for name in (*config.rows, *(config.sweep_rows if config.sweep else ())):
+    first = [config.first_ball_serve] if config.rows and config.first_ball else []
+    for name in (*config.rows, *first, *(config.sweep_rows if config.sweep else ())):
         override_task(policy.config, [f"serve={name}"])
     task = override_task(policy.config, overrides)
     device = resolve_device(config.device)
@@ -174,18 +192,26 @@ def _with_bar(
     num_worlds: int,
     device: str,
     overrides: Sequence[str],
+    record: MakeRecorder | None = None,
 ) -> Row:
     """One row, with a progress bar of its serves."""
+    with _bar(config, label, serves) as show:
+        return evaluate_row(
+            policy, serve, serves, num_worlds, device, config.seed, overrides, config.warmup_serves, show, record
+        )
+
+
+@contextmanager
+def _bar(config: EvaluateConfig, label: str, total: int) -> Iterator[OnCount]:
+    """A progress bar of ``total`` serves, as a function of their number."""
     interval = 0.2 if sys.stderr.isatty() else SECONDS_PER_LINE
     look = {"desc": f"{label:<10}", "unit": "serve", "disable": not config.progress, "mininterval": interval}
-    with tqdm(total=serves, **look) as bar:
+    with tqdm(total=total, **look) as bar:
 
         def show(counted: int) -> None:
-            bar.update(min(counted, serves) - bar.n)
+            bar.update(min(counted, total) - bar.n)
 
-        return evaluate_row(
-            policy, serve, serves, num_worlds, device, config.seed, overrides, config.warmup_serves, show
-        )
+        yield show
 
 
 def _announce(files: Sequence[Path]) -> None:

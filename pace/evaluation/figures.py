@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from pace.config.sim import TableConfig
-from pace.evaluation.serves import PATH_STEPS, C, Row
+from pace.config.ball import TableConfig
+from pace.evaluation.records import C, rates
+from pace.evaluation.serves import PATH_STEPS, Row
 from pace.task.game import Outcome
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.image import AxesImage
     from matplotlib.legend import Legend
 
-STRIKES, LANDINGS, FOOTWORK = "strike_map.png", "landing_map.png", "footwork.png"
+STRIKES, LANDINGS, FOOTWORK, BALLS = "strike_map.png", "landing_map.png", "footwork.png", "by_ball.png"
 #: Serve ranges by speed, m/s, as in the paper's table II: label, fastest and slowest vx, colour.
 SPEED_CLASSES = (
     ("long, 6.2 to 6.5 m/s", -6.5, -6.2, "tab:red"),
@@ -159,6 +160,37 @@ def footwork(rows: Sequence[Row], table: TableConfig) -> Figure:
     return figure
 
 
+def ball_figure(rows: Sequence[Row], warmup_serves: int) -> Figure:
+    """Success by the number of the ball since the start of a world, with its 95 % interval, a line for each row.
+
+    The first ``warmup_serves`` balls, which the table leaves out, are grey.
+    """
+    from matplotlib.ticker import MaxNLocator
+
+    figure = new_figure(7.5, 4.2)
+    axes = figure.subplots()
+    for row in rows:
+        numbers, low, middle, high = success_by_ball(row.all_records)
+        axes.plot(numbers, middle, marker="o", markersize=3, label=row.serve.replace("_", "-"))
+        axes.fill_between(numbers, low, high, alpha=0.2, linewidth=0)
+    if warmup_serves:
+        axes.axvspan(0.5, warmup_serves + 0.5, color="0.9", zorder=0)
+    axes.set(xlabel="number of the ball since the start of its world (grey: not in the table)", ylabel="success, %")
+    axes.set_title("success by ball, with its 95 % interval")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.grid(alpha=0.3)
+    axes.legend()
+    return figure
+
+
+def success_by_ball(records: Tensor) -> tuple[list[int], list[float], list[float], list[float]]:
+    """Numbers of the balls of ``records``; lower bound, share and upper bound of success of each, in per cent."""
+    numbers = column(records, "ball").unique().long().tolist()
+    found = [rates(records[column(records, "ball") == number]) for number in numbers]
+    low, middle, high = ([100.0 * row[key] for row in found] for key in ("success_low", "success", "success_high"))
+    return numbers, low, middle, high
+
+
 def heat_map(labels: Sequence[tuple[str, str]], tables: Sequence[Sequence[Mapping[str, Any]]], title: str) -> Figure:
     """Hits and successes in per cent, with half of their 95 % interval: a line for each label (kind of change, text), a
     column for each serve range. ``tables`` holds the summaries of the rows of each line."""
@@ -213,12 +245,15 @@ def _finish(*panels: Axes) -> None:
         axes.grid(alpha=0.3)
 
 
-def write_figures(folder: Path, rows: Sequence[Row], table: TableConfig, target: tuple[float, float]) -> list[Path]:
-    """Draw the three figures of an evaluation in ``folder``; returns the files."""
+def write_figures(
+    folder: Path, rows: Sequence[Row], table: TableConfig, target: tuple[float, float], warmup_serves: int
+) -> list[Path]:
+    """Draw the figures of an evaluation in ``folder``; returns the files."""
     figures = {
         STRIKES: strike_map(rows, table),
         LANDINGS: landing_map(rows, table, target),
         FOOTWORK: footwork(rows, table),
+        BALLS: ball_figure(rows, warmup_serves),
     }
     for name, figure in figures.items():
         figure.savefig(folder / name, dpi=DPI)

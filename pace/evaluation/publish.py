@@ -23,7 +23,8 @@ from pace.runs.metrics import write_slim
 from pace.runs.run_folder import METRICS
 
 RUN_FILES = ("learning_curve.png", "versions.json")
-EVALUATION_FILES = ("evaluation.json", "evaluation.md", "evaluation.csv", "strike_map.png", "landing_map.png")
+EVALUATION_FILES = ("evaluation.json", "evaluation.md", "evaluation.csv")
+EVALUATION_FILES += ("strike_map.png", "landing_map.png", "by_ball.png")
 SWEEP_FILES = ("sweep.json", "sweep.png")
 #: All files that this module writes into a folder; it leaves other files alone.
 FILES = (META, WEIGHTS, METRICS, CARD, *RUN_FILES, *EVALUATION_FILES, *SWEEP_FILES)

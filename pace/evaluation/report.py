@@ -11,7 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from pace.config.commands import PaperRow
-from pace.evaluation.serves import COLUMNS, FAILURES, Row
+from pace.evaluation.quality_report import more_tables
+from pace.evaluation.records import COLUMNS, FAILURES, by_ball
+from pace.evaluation.serves import Row
+from pace.evaluation.text import interval, markdown_table, number, text_table
 
 JSON, CSV, MARKDOWN, SERVES = "evaluation.json", "evaluation.csv", "evaluation.md", "serves.csv"
 UNITS = {
@@ -21,21 +24,14 @@ UNITS = {
     "net_clearance": "m, mean air between net and ball over successes",
     "predictor_rmse_cm": "cm, 3-D error of the predicted apex; by_time: by s before the apex",
     "failures": "serves without success; rim: return off the paddle's rim that failed",
+    "by_ball": "the same shares by the number of the ball since the start of a world, with the first balls",
+    "first_ball": "of robots that stood ready for wait (s); who falls until then has lost the ball",
+    "quality": "m, s, rad/s, W, degrees (lean), /s (feet_lifted), shares of time; p5, p50, p95: percentiles",
 }
 HEADER = (
     "serve", "serves", "hit %", "95 %", "success %", "95 %", "paper hit %", "success %", "out m/s", "landing cm",
     "net cm", "predictor cm", "falls/1,000",
 )  # fmt: skip
-
-
-def number(value: float, factor: float = 1.0, digits: int = 1) -> str:
-    """``value`` times ``factor``, or a dash for NaN."""
-    return "-" if math.isnan(value) else f"{factor * value:,.{digits}f}"
-
-
-def interval(row: Mapping[str, Any], name: str) -> str:
-    """The interval of a share, in per cent."""
-    return f"{number(row[f'{name}_low'], 100)} to {number(row[f'{name}_high'], 100)}"
 
 
 def cells(row: Mapping[str, Any], paper: Mapping[str, PaperRow]) -> list[str]:
@@ -68,30 +64,29 @@ def error_cells(row: Mapping[str, Any]) -> list[str]:
     return [row["serve"], *(number(value) for value in row["predictor_rmse_cm_by_time"].values())]
 
 
-def text_table(header: Sequence[str], body: Sequence[Sequence[str]]) -> str:
-    """Columns of equal width, the first to the left, the others to the right."""
-    widths = [max(len(line[i]) for line in (header, *body)) for i in range(len(header))]
-
-    def line(cells: Sequence[str]) -> str:
-        first, *rest = (cell.rjust(width) for cell, width in zip(cells, widths, strict=True))
-        return "  ".join([first.strip().ljust(widths[0]), *rest]).rstrip()
-
-    return "\n".join([line(header), line(["-" * width for width in widths]), *(line(cells) for cells in body)])
-
-
-def markdown_table(header: Sequence[str], body: Sequence[Sequence[str]]) -> str:
-    """The same as Markdown."""
-    rule = ["---", *["---:"] * (len(header) - 1)]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in (header, rule, *body))
-
-
 def bin_label(name: str) -> str:
     """A bin of the predictor's error in words: ``0.1_0.2s`` is "0.1 to 0.2s"."""
     return "after the apex" if name == "after_apex" else name.replace("_", " to ").replace("over to", "over")
 
 
-def tables(rows: Sequence[Row], paper: Mapping[str, PaperRow], markdown: bool = False) -> str:
-    """The whole evaluation: rates beside the paper's, then failures, then the predictor."""
+def more(rows: Sequence[Row], first_ball: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """What an evaluation's files hold besides the summaries of its rows: rates by the ball's number, the rows of the
+    first ball, and the quality of play, if it was measured."""
+    content: dict[str, Any] = {"by_ball": {row.serve: by_ball(row.all_records) for row in rows}}
+    if first_ball:
+        content["first_ball"] = dict(first_ball)
+    quality = {row.serve: row.quality for row in rows if row.quality}
+    return content | ({"quality": quality} if quality else {})
+
+
+def tables(
+    rows: Sequence[Row],
+    paper: Mapping[str, PaperRow],
+    markdown: bool = False,
+    first_ball: Mapping[str, Any] | None = None,
+) -> str:
+    """The whole evaluation: rates beside the paper's, then failures, the predictor, and :func:`more`, which is compact
+    in the terminal."""
     table = markdown_table if markdown else text_table
     summaries = [row.summary for row in rows]
     bins = [bin_label(name) for name in summaries[0]["predictor_rmse_cm_by_time"]]
@@ -101,6 +96,7 @@ def tables(rows: Sequence[Row], paper: Mapping[str, PaperRow], markdown: bool = 
         table(("serve", *(name.replace("_", " ") for name in FAILURES)), [failure_cells(row) for row in summaries]),
         "Error of the predicted apex, cm, by time before it:",
         table(("serve", *bins), [error_cells(row) for row in summaries]),
+        *more_tables(more(rows, first_ball), table, compact=not markdown),
     ]
     return "\n\n".join(parts)
 
@@ -152,17 +148,22 @@ def write_serves(path: Path, rows: Sequence[Row]) -> None:
 
 
 def write_report(
-    folder: Path, rows: Sequence[Row], paper: Mapping[str, PaperRow], context: Mapping[str, Any]
+    folder: Path,
+    rows: Sequence[Row],
+    paper: Mapping[str, PaperRow],
+    context: Mapping[str, Any],
+    first_ball: Mapping[str, Any] | None = None,
 ) -> list[Path]:
     """JSON, CSV, Markdown and the single serves in ``folder``; returns the files."""
     files = [folder / name for name in (JSON, CSV, MARKDOWN, SERVES)]
     summaries = [row.summary for row in rows]
     seconds = {row.serve: round(row.seconds, 1) for row in rows}
     published = {name: vars(paper[name]) for name in (row.serve for row in rows) if name in paper}
-    write_json(files[0], {"rows": summaries, **context, "paper": published, "units": UNITS, "seconds": seconds})
+    content = {"rows": summaries, **context, "paper": published, "units": UNITS, "seconds": seconds}
+    write_json(files[0], content | more(rows, first_ball))
     write_csv(files[1], summaries)
     title = f"# Evaluation of {context['policy']}\n\n{describe(context)}\n"
-    files[2].write_text(f"{title}\n{tables(rows, paper, markdown=True)}\n")
+    files[2].write_text(f"{title}\n{tables(rows, paper, markdown=True, first_ball=first_ball)}\n")
     write_serves(files[3], rows)
     return files
 

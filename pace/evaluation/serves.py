@@ -17,47 +17,26 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pace.evaluation.records import COLUMNS, C, summarise
 from pace.predictor.network import predictor_slices
 from pace.predictor.regression import BIN_NAMES, TIME_BINS
 from pace.rl.policies import TaskPolicy
 from pace.task.env import TableTennisEnv
 from pace.task.game import Outcome
 
-#: Columns of a serve's record, m and m/s, world frame. NaN where there is none.
-COLUMNS = (
-    "serve_vx", "serve_vy", "serve_vz",  # at launch
-    "outcome",  # pace.task.game.Outcome
-    "hit", "rim", "fall",  # 0 or 1; fall: the robot fell, or left its area, before the serve was over
-    "strike_x", "strike_y", "strike_z",  # of the paddle's contact with the ball
-    "speed_out",  # of the ball after the hit
-    "landing_x", "landing_y", "net_height",  # of the flight after the hit (its forecast, which is the simulation)
-)  # fmt: skip
-C = {name: index for index, name in enumerate(COLUMNS)}
-#: Failures of a serve; ``rim`` takes precedence over the outcome after it.
-FAILURES = ("miss", "net", "out", "own_side", "rim", "double_hit", "volley", "fall")
-#: Outcomes that count as ``rim`` after a hit with the rim.
-RIM_FAULTS = (Outcome.NET, Outcome.OUT, Outcome.OWN_SIDE)
-Z95 = 1.959963984540054  # 97.5 % quantile of the normal distribution
 PATH_WORLDS = 6  # worlds whose base path is kept
 PATH_STEPS = 400  # control steps of it, 8 s
 PATIENCE = 4  # times the longest duration of the serves; beyond it serves keep missing the table
+ENDLESS = ("serve.serves_per_episode=0", "serve.end_after_hit=0")  # every ball is followed to its end
 STEPS_PER_LOOK = 10  # control steps between two reads of the counts: each read waits for the device
 
 OnCount = Callable[[int], None]
+#: Makes a recorder from the environment, the first serves that are not counted, and those of each world that are.
+MakeRecorder = Callable[[TableTennisEnv, int, int], "ServeRecorder"]
 
 
 class EvaluationError(RuntimeError):
     """An evaluation that cannot be finished; the message says why."""
-
-
-def wilson(count: int, total: int) -> tuple[float, float]:
-    """95 % confidence interval of a share (E. B. Wilson 1927); NaN when nothing was counted."""
-    if total == 0:
-        return math.nan, math.nan
-    share, square = count / total, Z95**2 / total
-    centre = (share + square / 2) / (1 + square)
-    half = Z95 * math.sqrt(share * (1 - share) / total + square / (4 * total)) / (1 + square)
-    return max(0.0, centre - half), min(1.0, centre + half)
 
 
 class ServeRecorder:
@@ -66,8 +45,9 @@ class ServeRecorder:
     Call :meth:`begin` after the worlds' reset, :meth:`observe` after each ``advance`` and before the reset of fallen
     worlds, :meth:`begin` again after that.
 
-    Attributes: ``records`` (N * quota + 1, columns), world by world, the last row unused; ``counted``, ``played``,
-    ``bad`` (N,); ``finished`` (N,) bool, all its serves are counted and the pause after the last one is over; ``path``
+    Attributes: ``records`` (N * quota + 1, columns), world by world, the last row unused; ``early`` (N * warmup_serves
+    + 1, columns), the same of the first serves, NaN if one was bad; ``counted``, ``played``, ``bad`` (N,); ``finished``
+    (N,) bool, all its serves are counted and the pause after the last one is over; ``path``
     (T, W, 3) base x, y (m) and number of the serve, NaN where not filled.
     """
 
@@ -75,10 +55,12 @@ class ServeRecorder:
         n, device = env.num_worlds, env.worlds.device
         self.env, self.quota, self._warmup = env, quota, warmup_serves
         self.records = torch.full((n * quota + 1, len(COLUMNS)), torch.nan, device=device)
+        self.early = torch.full((n * warmup_serves + 1, len(COLUMNS)), torch.nan, device=device)
         self.counted, self.played, self.bad = (torch.zeros(n, dtype=torch.long, device=device) for _ in range(3))
         self.path = torch.full((PATH_STEPS, min(n, PATH_WORLDS), 3), torch.nan, device=device)
         self._current = torch.full((n, len(COLUMNS)), torch.nan, device=device)
-        self._first_row = torch.arange(n, device=device) * quota
+        worlds = torch.arange(n, device=device)
+        self._first_row, self._first_early = worlds * quota, worlds * warmup_serves
         self._last_row = torch.full_like(self._first_row, n * quota)
         self.finished = torch.zeros(n, dtype=torch.bool, device=device)
         self._started = torch.ones(n, dtype=torch.bool, device=device)
@@ -117,7 +99,9 @@ class ServeRecorder:
         speed = torch.linalg.vector_norm(events.hit_velocity_out, dim=1, keepdim=True)
         rim = events.hit_rim.unsqueeze(-1).float()
         hit = torch.cat((torch.ones_like(rim), rim, torch.zeros_like(rim), events.hit_point, speed), dim=1)
-        hit = torch.cat((hit, returns.landing[:, :2], returns.net_height.unsqueeze(-1)), dim=1)
+        paddle = events.hit_velocity_in - events.hit_relative_velocity
+        paddle = torch.linalg.vector_norm(paddle, dim=1, keepdim=True)
+        hit = torch.cat((hit, returns.landing[:, :2], returns.net_height.unsqueeze(-1), paddle), dim=1)
         now = env.game.referee.hit_now.unsqueeze(-1)
         columns = self._current[:, C["hit"] :]
         columns.copy_(torch.where(now, hit, columns))
@@ -140,11 +124,13 @@ class ServeRecorder:
     def _close(self, over: Tensor) -> None:
         env = self.env
         self._current[:, C["outcome"]] = env.serve_outcome.float()
+        self._current[:, C["ball"]] = self.played + 1.0
         self._current[:, C["fall"]] = env.terminated.float()
         in_pause = env.terminated & ~over
         charged = torch.where(in_pause, self._last_row, self.records.shape[0] - 1)
         self.records[:, C["fall"]].index_fill_(0, charged, 1.0)
         bad = env.serve_outcome == Outcome.BAD_SERVE
+        self._keep_early(over & ~bad & (self.played < self._warmup))
         due = over & self.counting
         kept = due & ~bad
         rows = torch.where(kept, self._first_row + self.counted, self.records.shape[0] - 1)
@@ -157,6 +143,14 @@ class ServeRecorder:
         pausing = env.game.pause.waiting & ~env.terminated
         self.finished |= (self.counted == self.quota) & ~pausing
 
+    def _keep_early(self, kept: Tensor) -> None:
+        rows = torch.where(kept, self._first_early + self.played, self.early.shape[0] - 1)
+        self.early.index_copy_(0, rows, self._current)
+
+    def quality(self) -> dict[str, Any]:
+        """What else a recorder measured of the row; this one nothing."""
+        return {}
+
     def predictor_errors(self) -> tuple[float, dict[str, float]]:
         """RMSE of the predicted apex (3-D, cm): over all, and by time to the apex; NaN without a predictor."""
         if self.env.actor.predictor is None:
@@ -168,18 +162,26 @@ class ServeRecorder:
 
 @dataclass(frozen=True)
 class Row:
-    """One serve range: the summary for the files; every counted serve (M, columns of ``COLUMNS``) and the base paths of
-    some worlds (T, W, 3) as in :class:`ServeRecorder`, on the CPU."""
+    """One serve range: the summary for the files; every counted serve (M, columns of ``COLUMNS``), the first serves
+    of each world, which are not counted, and the base paths of some worlds (T, W, 3) as in :class:`ServeRecorder`, on
+    the CPU; what else its recorder measured."""
 
     summary: dict[str, Any]
     records: Tensor
     path: Tensor
     seconds: float  # wall-clock
+    early: Tensor
+    quality: dict[str, Any]
 
     @property
     def serve(self) -> str:
         """Name of the serve range."""
         return self.summary["serve"]
+
+    @property
+    def all_records(self) -> Tensor:
+        """Every serve of the row (M, columns), the first ones of each world too."""
+        return torch.cat((self.early, self.records))
 
 
 def play(env: TableTennisEnv, policy: TaskPolicy, recorder: ServeRecorder, on_count: OnCount | None = None) -> None:
@@ -222,18 +224,18 @@ def evaluate_row(
     overrides: Sequence[str] = (),
     warmup_serves: int = 2,
     on_count: OnCount | None = None,
+    record: MakeRecorder | None = None,
 ) -> Row:
     """Play at least ``serves`` serves of the range ``serve`` (a name of configs/serve/), without episode ends.
 
-    ``overrides`` as for :func:`~pace.config.overrides.override_task`. The same arguments, on the same
-    device, give the same row.
+    ``overrides`` as for :func:`~pace.config.overrides.override_task`; ``record``: another recorder than
+    :class:`ServeRecorder`. The same arguments, on the same device, give the same row.
 
     Errors: :class:`pace.config.ConfigError` for unknown names and keys.
     """
     started = time.perf_counter()
-    endless = ("serve.serves_per_episode=0", "serve.end_after_hit=0")
-    env = policy.make_env(num_worlds, device, seed, ["reset=evaluation", f"serve={serve}", *overrides, *endless])
-    recorder = ServeRecorder(env, warmup_serves, math.ceil(serves / num_worlds))
+    env = policy.make_env(num_worlds, device, seed, ["reset=evaluation", f"serve={serve}", *overrides, *ENDLESS])
+    recorder = (record or ServeRecorder)(env, warmup_serves, math.ceil(serves / num_worlds))
     play(env, policy, recorder, on_count)
     records = recorder.records[:-1].cpu()
     table = env.config.ball.table
@@ -245,49 +247,7 @@ def evaluate_row(
         "predictor_rmse_cm_by_time": by_time,
         "bad_serves": int(recorder.bad.sum()),
     }
-    return Row(summary, records, recorder.path.cpu(), time.perf_counter() - started)
-
-
-def summarise(serve: str, records: Tensor, target: tuple[float, float], clear_height: float) -> dict[str, Any]:
-    """Rates and means of a row from its records (M, columns).
-
-    Shares are of the serves; ``outbound_speed`` (m/s) is a mean over hits, ``landing_error`` (m, to ``target``) and
-    ``net_clearance`` (m, under the ball; ``clear_height`` m is the lowest height that passes) over successes.
-    """
-    total = records.shape[0]
-    hit = records[:, C["hit"]] > 0
-    success = records[:, C["outcome"]] == Outcome.SUCCESS
-    hits, successes = int(hit.sum()), int(success.sum())
-    hit_low, hit_high = wilson(hits, total)
-    success_low, success_high = wilson(successes, total)
-    landing = records[success][:, [C["landing_x"], C["landing_y"]]]
-    error = torch.linalg.vector_norm(landing - torch.tensor(target), dim=1)
-    return {
-        "serve": serve,
-        "serves": total,
-        "hit": hits / max(total, 1),
-        "hit_low": hit_low,
-        "hit_high": hit_high,
-        "success": successes / max(total, 1),
-        "success_low": success_low,
-        "success_high": success_high,
-        "outbound_speed": _mean(records[hit][:, C["speed_out"]]),
-        "landing_error": _mean(error),
-        "net_clearance": _mean(records[success][:, C["net_height"]] - clear_height),
-        "falls_per_1000": 1000.0 * float(records[:, C["fall"]].sum()) / max(total, 1),
-        "rim_hits": int((hit & (records[:, C["rim"]] > 0)).sum()),
-        "failures": count_failures(records),
-    }
-
-
-def _mean(values: Tensor) -> float:
-    """Mean without NaN."""
-    return float(values[~values.isnan()].double().mean())
-
-
-def count_failures(records: Tensor) -> dict[str, int]:
-    """Counts of the serves without success, by the names of :data:`FAILURES`; the counts add up to them."""
-    outcome, rim = records[:, C["outcome"]], records[:, C["rim"]] > 0
-    by_rim = rim & sum((outcome == code for code in RIM_FAULTS), torch.zeros_like(rim))
-    counts = {name: int(((outcome == Outcome[name.upper()]) & ~by_rim).sum()) for name in FAILURES if name != "rim"}
-    return {name: int(by_rim.sum()) if name == "rim" else counts[name] for name in FAILURES}
+    early = recorder.early[:-1].cpu()
+    early = early[~early[:, C["outcome"]].isnan()]
+    quality = recorder.quality()
+    return Row(summary, records, recorder.path.cpu(), time.perf_counter() - started, early, quality)

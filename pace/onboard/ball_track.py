@@ -12,8 +12,6 @@ from pace.config.task import TaskConfig
 from pace.sim.ball.aero import GRAVITY
 
 NET_X = 0.0  # m, world frame
-#: s; a ball without a frame is extrapolated for so long: the longest runs of lost frames (configs/sensing/mocap.yaml).
-LONGEST_GAP = 0.1
 
 
 class Track(NamedTuple):
@@ -36,13 +34,13 @@ class BallTrack(nn.Module):
 
     Three things begin a new track. A jump: the ball is sensed farther from its last position than a ball flies between
     the two frames. A reversal: a ball that moved away comes towards the robot again beyond the net, where only another
-    player or a serving machine sends it back. A gap: no frame showed the ball for longer than ``LONGEST_GAP``.
+    player or a serving machine sends it back. A gap: no frame showed the ball for longer than ``sensing.longest_gap``.
 
     Positions are one control step apart. If no frame arrived in a step, its position is extrapolated from the last two,
-    in free fall; once the newest frame is older than ``LONGEST_GAP``, the ball stays where it is.
+    in free fall; once the newest frame is older than ``sensing.longest_gap``, the ball stays where it is.
 
-    Args: config: ``predictor.frames``, ``sensing.moved``, ``sensing.fastest_ball``, ``robot.control_dt`` and
-    ``reward.nothing_to_hit``.
+    Args: config: ``predictor.frames``, ``sensing.moved``, ``sensing.fastest_ball``, ``sensing.longest_gap``,
+    ``robot.control_dt`` and ``reward.nothing_to_hit``.
     Errors: :class:`ConfigError` for fewer than three frames.
     """
 
@@ -55,7 +53,8 @@ class BallTrack(nn.Module):
             raise ConfigError(
                 f"predictor.frames must be at least 3, got {self.frames}: the ball's velocity is seen over 3"
             )
-        self.fastest_ball, self.control_dt = config.sensing.fastest_ball, config.robot.control_dt
+        self.fastest_ball, self.longest_gap = config.sensing.fastest_ball, config.sensing.longest_gap
+        self.control_dt = config.robot.control_dt
         # m in a control step; a buffer, since a captured step brings nothing to the device
         fall = torch.tensor([0.0, 0.0, GRAVITY * self.control_dt**2])
         self.register_buffer("fall", fall, persistent=False)
@@ -87,14 +86,14 @@ class BallTrack(nn.Module):
         between = (track.age + self.control_dt - age).clamp(min=self.control_dt)  # s
         jumped = (sensed - track.positions[:, -3:]).square().sum(1) > (self.fastest_ball * between).square()
         towards = track.positions[:, -6] - sensed[:, 0] > self.moved  # over two steps
-        unseen = between > LONGEST_GAP + self.control_dt
+        unseen = between > self.longest_gap + self.control_dt
         return jumped | unseen | (track.turned & towards & (sensed[:, 0] > NET_X))
 
     def _extrapolate(self, positions: Tensor, age: Tensor) -> Tensor:
         """(N, 3) m: the ball one control step after the last of its positions."""
         last = positions[:, -3:]
         step = last - positions[:, -6:-3] - self.fall
-        return torch.where((age < LONGEST_GAP).unsqueeze(1), last + step, last)
+        return torch.where((age < self.longest_gap).unsqueeze(1), last + step, last)
 
     def append(self, positions: Tensor, sensed: Tensor, new_ball: Tensor) -> Tensor:
         """The positions (N, 3 * frames) m alone, after one more control step; those of ``new_ball`` (N,) restart."""

@@ -8,8 +8,8 @@ import torch
 from omegaconf import OmegaConf
 from torch import Tensor
 
+from pace.config.ball import TableConfig
 from pace.config.base import config_dir
-from pace.config.sim import TableConfig
 from pace.sim.ball.ball import DEFAULT_PRESET, BallParams, BallSim, Forecast, ball_preset
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import math
 import time
-from pathlib import Path
 
 import torch
 from omegaconf import DictConfig
@@ -26,7 +25,7 @@ from pace.runs.checkpoint import FOLDER, Checkpoint, save_checkpoint
 from pace.runs.interrupt import StopRequest
 from pace.runs.optimiser import learning_rate
 from pace.runs.progress import Progress
-from pace.runs.run_folder import METRICS, RunFolder, default_folder
+from pace.runs.run_folder import METRICS, RunFolder
 
 RESULT = "predictor.json"
 FINAL_ROLLOUTS = 20  # rollouts of the final measurement, not used for training
@@ -96,8 +95,8 @@ def train_predictor(composed: DictConfig) -> None:
     """Train as the composed configuration says, and print what was written."""
     config = parse(composed, TrainConfig)
     session = PredictorRun(config)
-    config.out = config.out or str(default_folder(config.name))
-    run = RunFolder(Path(config.out), to_dict(config), config.tensorboard)
+    run = RunFolder(config.out, to_dict(config), config.tensorboard)
+    config.out = str(run.path)
     print(f"training the predictor on serves in {config.num_worlds} worlds, run folder {run.path}", flush=True)
     counters = session.train(run)
     run.close()

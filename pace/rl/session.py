@@ -18,16 +18,18 @@ from omegaconf import DictConfig, OmegaConf
 from pace.config.base import ConfigError, parse, to_dict
 from pace.config.predictor import PredictorPriors
 from pace.config.training import RESUME_KEYS, TrainConfig
-from pace.devices import resolve_device, threads_of
+from pace.cores import threads_of
+from pace.devices import resolve_device
 from pace.distributed import ProcessGroup, own_device, process_group, suitable_size
 from pace.predictor.network import BallPredictor, make_predictor
 from pace.predictor.priors import resolve_priors
 from pace.rl.curriculum import Curriculum
 from pace.rl.policies import locate
 from pace.rl.trainer import Summary, Trainer, device_type_of, restarts_worlds
-from pace.runs.checkpoint import Checkpoint, CheckpointError, load_checkpoint
+from pace.runs.checkpoint import FOLDER, NAME, Checkpoint, CheckpointError, load_checkpoint
+from pace.runs.learning_curve import CURVE
 from pace.runs.progress import rate_texts
-from pace.runs.run_folder import CURVE, METRICS, RunFolder, default_folder
+from pace.runs.run_folder import METRICS, RunFolder, is_run
 
 if TYPE_CHECKING:
     from pace.task.env import TableTennisEnv
@@ -40,7 +42,7 @@ def train_from_config(composed: DictConfig) -> None:
     hydra = HydraConfig.get()
     overrides = list(hydra.overrides.task)
     if config.resume:
-        saved = load_checkpoint(config.resume)
+        saved = load_checkpoint(locate(config.resume))
         config = resumed_config(saved, config.resume, overrides)
     else:
         saved = None
@@ -61,6 +63,8 @@ def train_from_config(composed: DictConfig) -> None:
 def resumed_config(saved: Checkpoint, path: str, overrides: list[str]) -> TrainConfig:
     """The saved configuration with the limits of the command line.
 
+    A checkpoint that lies in a run resumes that run. One from anywhere else, or with ``out=``, begins a new run folder.
+
     Errors: :class:`ConfigError` for an override of anything that a resumed run may not change.
     """
     for override in overrides:
@@ -72,9 +76,18 @@ def resumed_config(saved: Checkpoint, path: str, overrides: list[str]) -> TrainC
     config.resume, config.init_from, config.predictor_from = path, None, None
     if saved.counters["samples"] >= config.samples:
         raise ConfigError(f"{path} has {saved.counters['samples']} samples: give samples= above that to continue")
-    if saved.path is not None:  # where the run lies now; it may have been moved or copied since it was saved
-        config.out = str(saved.path.parent.parent)
+    if not any(override.split("=")[0] == "out" for override in overrides):
+        run = run_of(saved.path)  # where the run lies now; it may have been moved or copied since it was saved
+        config.out = str(run) if run else None
     return config
+
+
+def run_of(checkpoint: Path | None) -> Path | None:
+    """The run folder in which a checkpoint lies as the run has written it, or None."""
+    if checkpoint is None or checkpoint.parent.name != FOLDER or not NAME.fullmatch(checkpoint.name):
+        return None
+    folder = checkpoint.parent.parent
+    return folder if is_run(folder) else None
 
 
 def build_trainer(config: TrainConfig, saved: Checkpoint | None, device: torch.device, group: ProcessGroup) -> Trainer:
@@ -86,13 +99,29 @@ def build_trainer(config: TrainConfig, saved: Checkpoint | None, device: torch.d
         raise ConfigError(f"num_worlds {config.num_worlds} cannot be shared equally by {group.size} processes")
     start = first_weights(config)
     config.predictor = resolve_priors(config, learned_priors(start) if start else None)
+    run = open_run(config, int(saved.counters["updates"]) if saved else 0) if group.is_rank_0 else None
+    try:
+        return _build(config, saved, start, device, group, run)
+    except BaseException:
+        if run is not None:
+            run.abandon()
+        raise
+
+
+def _build(
+    config: TrainConfig,
+    saved: Checkpoint | None,
+    start: Checkpoint | None,
+    device: torch.device,
+    group: ProcessGroup,
+    run: RunFolder | None,
+) -> Trainer:
     torch.manual_seed(config.seed)
     predictor = make_predictor(config.predictor).to(device)
     new_worlds = saved is not None and restarts_worlds(saved, group, device)
     offset = int(saved.counters["updates"]) if saved and new_worlds else 0  # else the samples of update 0 would repeat
     make = partial(make_worlds, device=device, group=group, predictor=predictor, seed_offset=offset)
     curriculum = Curriculum(config, make, saved.counters["samples"] if saved else 0.0)
-    run = open_run(config, int(saved.counters["updates"]) if saved else 0) if group.is_rank_0 else None
     trainer = Trainer(config, curriculum.worlds, predictor, run, group, curriculum)
     torch.manual_seed(group.seed(config.seed + offset))  # the networks are equal on all ranks, the rollouts are not
     if saved:
@@ -146,8 +175,9 @@ def learned_priors(start: Checkpoint) -> PredictorPriors:
 
 def open_run(config: TrainConfig, first_update: int) -> RunFolder:
     """The run folder that ``config`` names, or a new one, whose path ``config`` then holds."""
-    config.out = config.out or str(default_folder(config.name))
-    return RunFolder(Path(config.out), to_dict(config), config.tensorboard, first_update)
+    run = RunFolder(config.out, to_dict(config), config.tensorboard, first_update)
+    config.out = str(run.path)
+    return run
 
 
 def announce(trainer: Trainer, run: RunFolder, saved: Checkpoint | None) -> None:

@@ -22,6 +22,7 @@ from pace.rl.rollout import RolloutError, TrainableTask
 from pace.rl.update import Update
 from pace.runs.checkpoint import (
     FOLDER,
+    LAST_GOOD,
     Checkpoint,
     CheckpointError,
     list_checkpoints,
@@ -30,11 +31,11 @@ from pace.runs.checkpoint import (
     save_checkpoint,
 )
 from pace.runs.interrupt import StopRequest
+from pace.runs.learning_curve import plot_learning_curve
 from pace.runs.progress import Progress
-from pace.runs.run_folder import RunFolder, plot_learning_curve
+from pace.runs.run_folder import RunFolder
 
 CHECKPOINTS_KEPT = 4
-LAST_GOOD = "last_good"  # folder in the run: the weights before an update that failed
 LEARNER, OLD_LEARNER = "algorithm", "ppo"  # part of a checkpoint's training state, and its former name
 
 
@@ -102,6 +103,8 @@ class Trainer:
         started = last = time.monotonic()
         wall_before, reason = self.wall_s, None
         try:
+            if self.run is not None:
+                self.run.begin()
             with self._stop.listening():
                 while reason is None:
                     row = self._safe_update()

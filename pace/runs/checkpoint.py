@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,9 +22,14 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from pace.config.upgrade import FORMAT, upgrade_config, upgrade_state
+from pace.runs.files import reason
 
 META, WEIGHTS, TRAINING = "checkpoint.json", "weights.safetensors", "training.safetensors"
 FOLDER = "checkpoints"
+FILES = (META, WEIGHTS, TRAINING)
+NAME = re.compile(r"update_(\d{8,})")  # of the folders that a run writes; others beside them are the user's
+LAST_GOOD = "last_good"  # folder in a run: the weights before an update that failed
+LEFTOVER = re.compile(rf"\.(update_\d{{8,}}|{LAST_GOOD})\.\d+\.(tmp|old)")  # of a kill while a checkpoint was written
 TENSOR_MARK = "__tensor__"
 
 
@@ -73,11 +79,23 @@ def restore_tensors(value: Any, tensors: Mapping[str, Tensor], source: Path) -> 
 
 
 def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> Path:
-    """Write ``checkpoint`` as ``folder``, whole or not at all; an existing folder of that name is replaced."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
+    """Write ``checkpoint`` as ``folder``, whole or not at all; an existing checkpoint of that name is replaced.
+
+    Errors: :class:`CheckpointError` for a disk that is full or cannot be written; what was there stays.
+    """
     temporary = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
-    shutil.rmtree(temporary, ignore_errors=True)
-    temporary.mkdir()
+    try:
+        temporary.mkdir(parents=True)
+        _write(temporary, checkpoint)
+        _replace(folder, temporary)
+    except (OSError, SafetensorError) as error:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise CheckpointError(f"{folder} cannot be written: {reason(error)}") from error
+    return folder
+
+
+def _write(folder: Path, checkpoint: Checkpoint) -> None:
+    """Write the files of ``checkpoint`` into a new folder, to the disk."""
     weights: dict[str, Tensor] = {}
     meta: dict[str, Any] = {
         "format": FORMAT,
@@ -89,21 +107,57 @@ def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> Path:
     if checkpoint.training is not None:
         training: dict[str, Tensor] = {}
         meta["training"] = flatten_tensors(checkpoint.training, "", training)
-        save_file(training, temporary / TRAINING)
-    save_file(weights, temporary / WEIGHTS)
-    (temporary / META).write_text(json.dumps(meta, indent=1))
-    _sync(temporary)
+        save_file(training, folder / TRAINING)
+    save_file(weights, folder / WEIGHTS)
+    (folder / META).write_text(json.dumps(meta, indent=1))
+    for file in (*folder.iterdir(), folder):
+        _sync(file)  # before the rename makes them the newest checkpoint
+
+
+def _replace(folder: Path, fresh: Path) -> None:
+    """Give ``fresh`` the name ``folder``. After a kill in between, :func:`clear_leftovers` puts back what was there."""
+    old = fresh.with_suffix(".old")
     if folder.exists():
-        shutil.rmtree(folder)
-    temporary.rename(folder)
-    return folder
+        folder.rename(old)
+    try:
+        fresh.rename(folder)
+    except OSError:
+        if old.exists():
+            old.rename(folder)
+        raise
+    _sync(folder.parent)
+    if old.exists() and holds_nothing_else(old):  # else it stays, with what a user has put there
+        shutil.rmtree(old, ignore_errors=True)
 
 
-def _sync(folder: Path) -> None:
-    """Flush the files to the disk before the rename makes them the newest checkpoint."""
-    for file in folder.iterdir():
-        with file.open("rb") as handle:
-            os.fsync(handle.fileno())
+def _sync(path: Path) -> None:
+    """Flush a file, or the names in a folder, to the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def clear_leftovers(run: Path) -> None:
+    """Remove what a kill has left of checkpoints that were being written. The caller owns the run."""
+    for folder in (path for place in (run, run / FOLDER) for path in _entries(place)):
+        left = LEFTOVER.fullmatch(folder.name)
+        if left is None or folder.is_symlink() or not holds_nothing_else(folder):
+            continue
+        if left[2] == "old" and not folder.with_name(left[1]).exists():
+            folder.rename(folder.with_name(left[1]))
+        else:
+            shutil.rmtree(folder)
+
+
+def _entries(folder: Path) -> list[Path]:
+    return sorted(folder.iterdir()) if folder.is_dir() else []
+
+
+def holds_nothing_else(folder: Path) -> bool:
+    """Whether a folder has the files of a checkpoint, or some of them, and nothing that a user has put there."""
+    return folder.is_dir() and all(file.name in FILES for file in folder.iterdir())
 
 
 def find_checkpoint(path: str | Path) -> Path:
@@ -111,7 +165,13 @@ def find_checkpoint(path: str | Path) -> Path:
 
     Errors: :class:`CheckpointError` when there is none.
     """
-    path = Path(path)
+    try:
+        return _find(Path(path))
+    except (OSError, ValueError) as error:  # no permission; a name that is too long, or has a zero byte
+        raise CheckpointError(f"{path} cannot be read: {reason(error)}") from error
+
+
+def _find(path: Path) -> Path:
     if path.is_file():
         path = path.parent
     if not path.exists():
@@ -122,13 +182,23 @@ def find_checkpoint(path: str | Path) -> Path:
         found = list_checkpoints(path)
         if found:
             return found[-1]
-        raise CheckpointError(f"{path} is a run folder without a checkpoint")
+        others = ", ".join(other.name for other in _entries(path / FOLDER) if (other / META).is_file())
+        named = f"; {FOLDER}/ holds {others}: name one of them" if others else ""
+        raise CheckpointError(f"{path} is a run folder without a checkpoint{named}")
     raise CheckpointError(f"{path} is neither a run folder nor a checkpoint: it has no {FOLDER}/ and no {META}")
 
 
 def list_checkpoints(run: Path) -> list[Path]:
-    """Complete checkpoints of a run, oldest first."""
-    return sorted(folder for folder in (run / FOLDER).glob("update_*") if (folder / META).is_file())
+    """Complete checkpoints that a run has written, oldest first. Copies beside them, of other names, are the user's."""
+    there = (folder for folder in _entries(run / FOLDER) if NAME.fullmatch(folder.name))
+    return sorted((folder for folder in there if (folder / META).is_file()), key=update_of)
+
+
+def update_of(checkpoint: Path) -> int:
+    """The update at which a run has written ``checkpoint``, by its name."""
+    name = NAME.fullmatch(checkpoint.name)
+    assert name is not None  # of a run
+    return int(name[1])
 
 
 def load_checkpoint(path: str | Path, weights_only: bool = False) -> Checkpoint:
@@ -198,9 +268,10 @@ def load_weights(module: nn.Module, weights: Mapping[str, Tensor], source: str) 
 
 
 def prune_checkpoints(run: Path, keep: int) -> None:
-    """Delete all but the newest ``keep`` checkpoints of a run."""
+    """Delete all but the newest ``keep`` checkpoints of a run; not one that is a link, or to which files were added."""
     for folder in list_checkpoints(run)[:-keep]:
-        shutil.rmtree(folder)
+        if not folder.is_symlink() and holds_nothing_else(folder):
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 #: Keys of where and how a run was made, not of what it learned: a published policy has their defaults.

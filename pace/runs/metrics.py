@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -70,10 +71,19 @@ class Passage:
 
 def read_metrics(file: str | Path, columns: Iterable[str] | None = None) -> dict[str, list[float]]:
     """Columns of a ``metrics.csv``, all or those of ``columns`` that it has; an empty cell is NaN."""
-    with Path(file).open(newline="") as handle:
+    with Path(file).open(newline="", errors="replace") as handle:
         rows = list(csv.DictReader(handle))
-    names = [name for name in (rows[0] if rows else ()) if columns is None or name in set(columns)]
-    return {name: [float(row[name] or "nan") for row in rows] for name in names}
+    head = [name for name in (rows[0] if rows else ()) if name is not None]  # None: cells beyond the columns
+    names = [name for name in head if columns is None or name in set(columns)]
+    return {name: [_number(row[name]) for row in rows] for name in names}
+
+
+def _number(cell: str | None) -> float:
+    """A cell's value; NaN for an empty one, and for one that a full disk or an editor has cut."""
+    try:
+        return float(cell or "nan")
+    except ValueError:
+        return math.nan
 
 
 def read_curve(file: str | Path, window: float = WINDOW, columns: Mapping[str, str] = RATES) -> Curve:

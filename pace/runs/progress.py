@@ -21,7 +21,9 @@ WINDOW = 25  # updates over which the shown rates are taken
 
 
 def clock(seconds: float) -> str:
-    """``h:mm:ss`` or ``mm:ss``."""
+    """``h:mm:ss`` or ``mm:ss``; ``--:--`` without an end."""
+    if math.isinf(seconds):
+        return "--:--"
     whole = max(0, round(seconds))
     hours, rest = divmod(whole, 3600)
     return f"{hours}:{rest // 60:02d}:{rest % 60:02d}" if hours else f"{rest // 60:02d}:{rest % 60:02d}"
@@ -81,7 +83,8 @@ class Progress:
         if self.seconds > 0:
             left = min(left, self.seconds - elapsed)
         left = max(left, 0.0)
-        return elapsed / max(elapsed + left, 1e-9), left
+        done = 0.0 if math.isinf(left) else elapsed / max(elapsed + left, 1e-9)
+        return done, left
 
     def _describe(self, row: dict[str, float], left: float) -> str:
         parts = [

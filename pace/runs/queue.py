@@ -21,10 +21,12 @@ from tqdm import tqdm
 from pace.command import quote
 from pace.config.base import ConfigError, parse, search_override, to_dict
 from pace.config.training import RESUME_KEYS, TrainConfig, load_train_config
+from pace.cores import core_set, usable_cores
 from pace.runs.checkpoint import list_checkpoints, read_meta
 from pace.runs.interrupt import StopRequest
+from pace.runs.metrics_file import LEADING
 from pace.runs.progress import SECONDS_PER_LINE, clock
-from pace.runs.run_folder import LEADING, METRICS
+from pace.runs.run_folder import METRICS
 
 TRAIN = (sys.executable, "-m", "pace.rl.train")
 POLL_SECONDS = 0.5
@@ -121,10 +123,15 @@ def logged_samples(folder: Path) -> int:
 
 
 def shares_of_cores(jobs: int) -> list[list[int]]:
-    """Cores for each of ``jobs`` processes, at least one; empty lists if the system does not bind to cores."""
-    if not hasattr(os, "sched_getaffinity"):
+    """Cores for each of ``jobs`` processes, at least one; empty lists if the system does not bind to cores.
+
+    With a quota below the number of cores, the first one depends on this process: others have quotas beside it.
+    """
+    cores, granted = core_set(), usable_cores()
+    if not cores:
         return [[] for _ in range(jobs)]
-    cores = sorted(os.sched_getaffinity(0))
+    first = os.getpid() % len(cores) if granted < len(cores) else 0
+    cores = sorted([*cores, *cores][first : first + granted])
     return [cores[slot::jobs] or [cores[slot % len(cores)]] for slot in range(jobs)]
 
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import csv
 import json
-import math
 import platform
+import re
 import subprocess
 import sys
 import tempfile
 import time
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -18,47 +19,52 @@ import yaml
 from filelock import FileLock, Timeout
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from torchrl.record.loggers.tensorboard import TensorboardLogger
 
 from pace.config.base import ConfigError
 from pace.config.upgrade import FORMAT
-from pace.runs.checkpoint import list_checkpoints
-from pace.runs.metrics import read_metrics
+from pace.runs.checkpoint import clear_leftovers, list_checkpoints, update_of
+from pace.runs.files import reason, say, write_whole
+from pace.runs.metrics_file import FIRST_COLUMN, EventsFile, MetricsFile
 
 STAMP = "# format: "  # begins the first line of a run's configuration
 LOCK = ".lock"
-CONFIG, VERSIONS, METRICS, CURVE = "config.yaml", "versions.json", "metrics.csv", "learning_curve.png"
+CONFIG, VERSIONS, METRICS, EVENTS = "config.yaml", "versions.json", "metrics.csv", "events"
 PACKAGES = ("torch", "torchrl", "tensordict", "mujoco", "mujoco-warp", "warp-lang", "numpy", "hydra-core")
-LEADING = (
-    "update", "samples", "wall_s", "samples_per_s", "hit_rate", "success_rate", "fall_rate", "predictor_rmse_cm",
-    "mean_reward", "kl", "lr", "policy_std",
-)  # fmt: skip
-CURVE_WINDOW = 40  # rows of the moving average in the plot
+LEFTOVER = re.compile(r"\.(config\.yaml|versions\.json|metrics\.csv)\.\d+\.tmp")  # of a kill while a file was written
 
 
-def default_folder(name: str) -> Path:
-    """``runs/<date>_<name>``, with a number if that exists already."""
+def new_folder(name: str) -> Path:
+    """Make ``runs/<date>_<name>``, with a number if that exists: of two commands in one second, each gets its own.
+
+    Errors: ``OSError``.
+    """
     base = Path("runs") / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}_{name}"
-    candidate, number = base, 2
-    while candidate.exists():
-        candidate, number = base.with_name(f"{base.name}_{number}"), number + 1
-    return candidate
+    base.parent.mkdir(parents=True, exist_ok=True)
+    for number in count(1):
+        folder = base if number == 1 else base.with_name(f"{base.name}_{number}")
+        with suppress(FileExistsError):
+            folder.mkdir()
+            return folder
+    raise AssertionError("count() does not end")
 
 
 def make_out(out: str | None, name: str) -> Path:
-    """The folder that a command writes: ``out``, or a new :func:`default_folder`. Made before the work begins.
+    """The folder that a command writes: ``out``, or a :func:`new_folder`. Made before the work begins.
 
     Errors: :class:`ConfigError` for one that cannot be made or written.
     """
-    folder = Path(out) if out else default_folder(name)
+    folder = Path(out) if out else Path("runs")
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"out={folder} cannot be made: {error.strerror}") from error
+        if out:
+            folder.mkdir(parents=True, exist_ok=True)
+        else:
+            folder = new_folder(name)
+    except (OSError, ValueError) as error:  # ValueError: a path with a zero byte
+        raise ConfigError(f"out={folder} cannot be made: {reason(error)}") from error
     try:
         tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
-        raise ConfigError(f"out={folder} cannot be written: {error.strerror}") from error
+        raise ConfigError(f"out={folder} cannot be written: {reason(error)}") from error
     return folder
 
 
@@ -96,35 +102,41 @@ def git_state(folder: Path) -> dict[str, Any] | None:
 
 
 class RunFolder:
-    """Files of one run, owned by one process at a time. Rows that a crashed run logged after ``first_update``, its last
-    checkpoint, are dropped.
+    """Files of one run, owned by one process at a time.
 
+    The folder is made and claimed at once; :meth:`begin` writes into it. Rows that a crashed run logged after
+    ``first_update``, its last checkpoint, are dropped then.
+
+    Args: path: ``None`` is a :func:`new_folder` of the configuration's ``name``.
     Errors: :class:`ConfigError` for a folder that cannot be made, that another process owns, or that holds a later
     checkpoint.
     """
 
-    def __init__(self, path: str | Path, config: dict[str, Any], tensorboard: bool, first_update: int = 0) -> None:
-        self.path = Path(path)
-        self._claim(first_update)
-        (self.path / CONFIG).write_text(f"{STAMP}{FORMAT}\n{OmegaConf.to_yaml(OmegaConf.create(config))}")
-        (self.path / VERSIONS).write_text(json.dumps(versions(), indent=1))
-        self._columns: list[str] = []
-        self._file = self._open_metrics(first_update)
-        self._board = TensorboardLogger("events", str(self.path)) if tensorboard else None
-
-    def _claim(self, first_update: int) -> None:
-        """Make the folder, which must not hold a checkpoint that is newer than the run's."""
-        make_out(str(self.path), "")
+    def __init__(
+        self, path: str | Path | None, config: dict[str, Any], tensorboard: bool, first_update: int = 0
+    ) -> None:
+        self._made = path is None or not Path(path).exists()
+        self.path = make_out(None if path is None else str(path), str(config.get("name", "")))
+        self._config, self._first_update = config if path else config | {"out": str(self.path)}, first_update
         self._lock = FileLock(self.path / LOCK)  # the system releases it when the process ends, for whatever reason
+        self._claim()
+        self._tensorboard = tensorboard
+        self._metrics: MetricsFile | None = None
+        self._events: EventsFile | None = None
+
+    def _claim(self) -> None:
+        """Own the folder, which must not hold a checkpoint that is newer than the run's."""
         try:
             self._lock.acquire(timeout=0)
         except Timeout as error:
             raise ConfigError(
                 f"{self.path} is in use by another process: end that first, or give another out="
             ) from error
+        except OSError as error:  # a file system without locks
+            say(f"warning: {self.path} cannot be locked ({reason(error)}): do not train another run in it")
         self._require_own()
-        last = max((int(folder.name.removeprefix("update_")) for folder in list_checkpoints(self.path)), default=0)
-        if last > first_update:
+        last = max((update_of(folder) for folder in list_checkpoints(self.path)), default=0)
+        if last > self._first_update:
             raise ConfigError(
                 f"{self.path} has a checkpoint of update {last}: resume={self.path} continues it; "
                 "or give another out=, or move it away"
@@ -134,99 +146,84 @@ class RunFolder:
         """The files that a run replaces must be a run's. Errors: :class:`ConfigError` for somebody else's."""
         config, metrics = self.path / CONFIG, self.path / METRICS
         ours = [
-            not config.exists() or _first_line(config).startswith(STAMP) or {"robot", "algo"} <= set(_keys(config)),
-            not metrics.exists() or metrics.stat().st_size == 0 or _first_line(metrics).startswith("update,"),
+            not config.exists() or is_run(self.path),
+            not metrics.exists() or metrics.stat().st_size == 0 or _first_line(metrics).startswith(FIRST_COLUMN),
         ]
         for file, own in zip((config, metrics), ours, strict=True):
             if not own:
                 raise ConfigError(f"{file} is no file of a run, and is not replaced: give another out=")
+
+    def begin(self) -> None:
+        """Write configuration and versions, and open the logs; :meth:`log` does so if this was not called.
+
+        Errors: :class:`ConfigError` for files that cannot be written.
+        """
+        if self._metrics is not None:
+            return
+        try:
+            clear_leftovers(self.path)
+            for file in self.path.iterdir():
+                if LEFTOVER.fullmatch(file.name):
+                    file.unlink()
+            self._describe()
+            self._metrics = MetricsFile(self.path / METRICS, self._first_update)
+        except OSError as error:
+            raise ConfigError(f"{error.filename or self.path} cannot be written: {reason(error)}") from error
+        if self._tensorboard:
+            first = self._metrics.samples + 1 if self._first_update else 0
+            self._events = EventsFile(self.path / EVENTS, first)
+
+    def _describe(self) -> None:
+        """Write configuration and versions."""
+        write_whole(self.path / CONFIG, f"{STAMP}{FORMAT}\n{OmegaConf.to_yaml(OmegaConf.create(self._config))}")
+        write_whole(self.path / VERSIONS, json.dumps(versions(), indent=1))
 
     @property
     def metrics_file(self) -> Path:
         """The CSV of metrics, one row per update."""
         return self.path / METRICS
 
-    def _open_metrics(self, first_update: int) -> Any:
-        kept: list[dict[str, str]] = []
-        if self.metrics_file.exists():
-            with self.metrics_file.open(newline="") as file:
-                reader = csv.DictReader(file)
-                kept = [row for row in reader if row["update"].isdigit() and int(row["update"]) <= first_update]
-                self._columns = list(reader.fieldnames or [])
-        file = self.metrics_file.open("w", newline="", buffering=1)
-        if self._columns:
-            writer = csv.DictWriter(file, self._columns)
-            writer.writeheader()
-            writer.writerows(kept)
-        return file
-
     def log(self, row: dict[str, float]) -> None:
-        """Append one row; the columns are those of the first row. NaN is an empty cell."""
-        writer = csv.DictWriter(self._file, self._columns, restval="", extrasaction="ignore")
-        if not self._columns:
-            self._columns = [*LEADING, *(name for name in row if name not in LEADING)]
-            writer = csv.DictWriter(self._file, self._columns, restval="", extrasaction="ignore")
-            writer.writeheader()
-        writer.writerow({name: _cell(value) for name, value in row.items()})
-        if self._board is not None:
-            for name, value in row.items():
-                if not math.isnan(value):
-                    self._board.log_scalar(name, value, step=int(row["samples"]))
+        """Append one row to the logs. NaN is an empty cell. A log that cannot be written waits, and says so."""
+        self.begin()
+        self.restore()
+        assert self._metrics is not None  # begin() opened it
+        self._metrics.add(row)
+        if self._events is not None:
+            self._events.add(row)
+
+    def restore(self) -> None:
+        """Make the folder again if it was deleted under the run, and say so. What was in it is lost."""
+        if self.path.exists():
+            return
+        say(f"warning: {self.path} was deleted: the run makes it again and goes on")
+        with suppress(OSError):  # the next file that is written there says why
+            self.path.mkdir(parents=True, exist_ok=True)
+            self._lock.release(force=True)
+            with suppress(Timeout):
+                self._lock.acquire(timeout=0)
+            self._describe()
 
     def close(self) -> None:
-        """Flush and close the logs, and release the folder."""
-        self._file.close()
+        """Close the logs, and release the folder."""
+        for log in (self._metrics, self._events):
+            if log is not None:
+                log.close()
         self._lock.release()
-        if self._board is not None:
-            self._board.experiment.close()
+
+    def abandon(self) -> None:
+        """Release the folder of a run that could not start; a new one is removed."""
+        self.close()
+        if self._made and self._metrics is None:
+            with suppress(OSError):  # somebody else has put something there
+                (self.path / LOCK).unlink(missing_ok=True)
+                self.path.rmdir()
 
 
-def _cell(value: float) -> str:
-    if math.isnan(value):
-        return ""
-    return str(int(value)) if float(value).is_integer() and abs(value) < 1e15 else f"{value:.6g}"
-
-
-def moving_average(values: list[float], window: int) -> list[float]:
-    """Mean of the last ``window`` values that are not NaN, at each position."""
-    result: list[float] = []
-    for end in range(1, len(values) + 1):
-        recent = [value for value in values[max(0, end - window) : end] if not math.isnan(value)]
-        result.append(sum(recent) / len(recent) if recent else math.nan)
-    return result
-
-
-def plot_learning_curve(run: str | Path) -> Path | None:
-    """Draw ``learning_curve.png`` from the run's CSV; None when it has fewer than two rows."""
-    from matplotlib.figure import Figure  # imported here: it takes a second that no training should wait for
-
-    metrics = read_metrics(Path(run) / METRICS)
-    if len(metrics.get("update", [])) < 2:
-        return None
-    millions = [samples / 1e6 for samples in metrics["samples"]]
-    panels = (
-        ("share of serves, %", (("hit_rate", "hits", 100.0), ("success_rate", "returns", 100.0))),
-        ("falls per s", (("fall_rate", "falls", 1.0),)),
-        ("predictor RMSE, cm", (("predictor_rmse_cm", "apex", 1.0),)),
-        ("policy std", (("policy_std", "std", 1.0),)),
-    )
-    figure = Figure(figsize=(9, 10), layout="constrained")
-    for axes, (label, curves) in zip(figure.subplots(len(panels), 1, sharex=True), panels, strict=True):
-        for column, name, factor in curves:
-            smooth = moving_average(metrics[column], CURVE_WINDOW)
-            axes.plot(millions, [factor * value for value in smooth], label=name)
-        axes.set_ylabel(label)
-        axes.update_datalim(
-            [(millions[0], 0.0)]
-        )  # zero is in view, and the upper margin is a share of the whole height
-        axes.autoscale_view()
-        axes.set_ylim(bottom=0)
-        axes.grid(alpha=0.3)
-        axes.legend(loc="best")
-    axes.set_xlabel(f"control steps, millions (mean of {CURVE_WINDOW} updates)")
-    file = Path(run) / CURVE
-    figure.savefig(file, dpi=110)
-    return file
+def is_run(folder: Path) -> bool:
+    """Whether a run wrote ``folder``, by its configuration."""
+    config = folder / CONFIG
+    return config.is_file() and (_first_line(config).startswith(STAMP) or {"robot", "algo"} <= set(_keys(config)))
 
 
 def _keys(file: Path) -> list[str]:
@@ -243,5 +240,5 @@ def _first_line(file: Path) -> str:
     try:
         with file.open() as text:
             return text.readline()
-    except UnicodeDecodeError:
+    except (OSError, UnicodeDecodeError):
         return ""

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+import mujoco
 import torch
 import warp as wp
 from torch import Tensor
@@ -16,8 +17,9 @@ from pace.arrays.draws import Column, UniformSampler, columns_of
 from pace.arrays.launch import Launch, MaskedLaunch
 from pace.arrays.state import Stateful, tensors_named, with_prefix
 from pace.arrays.tensors import allocate
+from pace.config.ball import BallConfig
 from pace.config.base import ConfigError
-from pace.config.sim import BallConfig, RandomizationConfig
+from pace.config.sim import RandomizationConfig
 from pace.sim.ball.ball import BallParams
 from pace.sim.engine.base import EngineParams
 from pace.sim.kinematics import Mount, MountArrays
@@ -32,6 +34,8 @@ SAMPLED_ENGINE_PARAMS = (
     "armature_scale",
     "effort_scale",
 )
+#: Likewise, sampled after all others, so that these of a seed are the same as before they existed.
+LATER_ENGINE_PARAMS = ("speed_scale", "ankle_effort_scale", "joint_friction", "joint_damping")
 #: Ball parameter -> (range, whether the sample scales the nominal value or is added to it).
 SAMPLED_BALL_PARAMS = {
     "mass": ("ball_mass_scale", True),
@@ -101,6 +105,20 @@ def _push(
     push[world, 1] = y
 
 
+def _require_possible(name: str, sampled: tuple[float, float], limits: tuple[float, float]) -> None:
+    """Errors: :class:`ConfigError` for samples that are all beyond the limits, to which they would be clamped."""
+    if sampled[1] < limits[0] - 1e-6 or sampled[0] > limits[1] + 1e-6:
+        got = f"[{sampled[0]:g}, {sampled[1]:g}]"
+        raise ConfigError(f"randomization.{name} with this ball gives {got}: nothing within {list(limits)}")
+
+
+def require_bodies(model: mujoco.MjModel, config: RandomizationConfig) -> None:
+    """Errors: :class:`ConfigError` for a trunk without mass."""
+    trunk, least = float(model.body_mass[int(model.jnt_bodyid[0])]), config.trunk_mass[0]
+    if trunk + least <= 0.0:
+        raise ConfigError(f"randomization.trunk_mass: with {least:g} kg nothing is left of the trunk's {trunk:.1f} kg")
+
+
 class Randomizer(Stateful):
     """Samples the parameters of N worlds at reset, and the pushes in between.
 
@@ -157,7 +175,10 @@ class Randomizer(Stateful):
             nominal, ends = self._nominal_ball[name], getattr(self.config, range_name)
             low, high = (end * nominal if scales else end + nominal for end in ends)
             limits = BALL_LIMITS.get(name, (0.0, float("inf")))
+            _require_possible(range_name, (low, high), limits)
             columns.append(Column(getattr(self._ball_params, name), low, high, *limits))
+        for name in LATER_ENGINE_PARAMS:
+            columns.append(Column(getattr(self._engine_params, name), *getattr(self.config, name)))
         columns.append(Column(self.backlash, *self.config.backlash))
         return columns + columns_of(self.paddle_error, self._mount_ranges())
 
@@ -184,7 +205,7 @@ class Randomizer(Stateful):
 
     def state_tensors(self) -> dict[str, Tensor]:
         """All samples, for an exact resume."""
-        engine = with_prefix("engine", tensors_named(self._engine_params, SAMPLED_ENGINE_PARAMS))
+        engine = with_prefix("engine", tensors_named(self._engine_params, SAMPLED_ENGINE_PARAMS + LATER_ENGINE_PARAMS))
         ball = with_prefix("ball", tensors_named(self._ball_params, tuple(SAMPLED_BALL_PARAMS)))
         motors = {"actuator_delay": self.actuator_delay, "backlash": self.backlash}
         return engine | ball | motors | {"until_push": self._until_push, "paddle_error": self.paddle_error}

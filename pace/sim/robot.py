@@ -8,14 +8,17 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from pace.config.ball import TableConfig
 from pace.config.base import ConfigError
-from pace.config.sim import EngineConfig, JointGroup, RobotConfig, TableConfig
-from pace.sim.robot_spec import PADDLE, RobotSpec, model_path, read_scene
+from pace.config.sim import EngineConfig, JointGroup, RobotConfig
+from pace.sim.robot_spec import PADDLE, TABLE_FORCES, TOUCH, RobotSpec, model_path, read_scene
 
 #: Name of the keyframe: nominal pose, soles on the floor.
 NOMINAL_KEY = "nominal"
 #: Group of the geoms that are only for display.
 VISUAL_GROUP = 2
+#: Of a contact sensor: the sum of all contacts that match.
+NET_FORCE = 3
 #: The only input of a motor: its target position.
 POSITION = int(mujoco.mjtCtrlInput.mjINPUT_POS)
 
@@ -53,6 +56,23 @@ def motor_lines(robot: RobotConfig) -> NDArray[np.float64] | None:
     return np.array([[joint_group(robot, name).max_speed for name in RobotSpec.of(robot).joints], stall])
 
 
+def joint_armature(robot: RobotConfig) -> NDArray[np.float64]:
+    """Armature (J,), kg m^2, of every joint: its group's, or ``robot.armature``.
+
+    Errors: those of :func:`joint_gains`.
+    """
+    found = [joint_group(robot, name).armature for name in RobotSpec.of(robot).joints]
+    return np.array([robot.armature if armature is None else armature for armature in found])
+
+
+def joint_friction(robot: RobotConfig) -> NDArray[np.float64]:
+    """Dry friction (J,), N m, of every joint.
+
+    Errors: those of :func:`joint_gains`.
+    """
+    return np.array([joint_group(robot, name).friction for name in RobotSpec.of(robot).joints])
+
+
 def joint_group(robot: RobotConfig, name: str) -> JointGroup:
     """The group of ``robot.joint_groups`` that counts for the joint ``name``.
 
@@ -68,17 +88,28 @@ def build_model(robot: RobotConfig, engine: EngineConfig, table: TableConfig, vi
     """Compile robot, table, floor and the mocap ball: nq = 7 + J, nv = 6 + J, nu = J.
 
     Args:
-        robot: gains, efforts, armature and nominal pose.
+        robot: gains, efforts, armature, friction, nominal pose, and the pairs of its geoms that touch each other.
         engine: time step, solver iterations and cone.
         table: size of table, net and paddle.
         visual: keep the geoms that are only for display. The dynamics are the same with and without them;
             physics leaves them out because each costs time in every step.
 
-    Errors: :class:`ConfigError` for gains or a pose that do not fit the robot's joints.
+    Errors: :class:`ConfigError` for gains or a pose that do not fit the robot's joints, for a free hand that the robot
+    does not have, and for pairs of ``robot.self_collision`` that the MJCF lacks a geom for, or lists already.
     """
+    return compile_scene(describe_scene(robot, engine, table, visual), robot)
+
+
+def describe_scene(robot: RobotConfig, engine: EngineConfig, table: TableConfig, visual: bool = False) -> mujoco.MjSpec:
+    """What :func:`build_model` compiles, with the same arguments and errors; parts can still be added."""
     spec = read_scene(model_path(robot))
     _set_motors(spec, robot)
+    _add_groups(spec, robot)
+    if robot.self_collision:
+        _add_pairs(spec, robot.self_collision)
+        _count_the_world_alone(spec)
     _fit_table(spec, table)
+    _sense_table(spec, robot.free_hand)
     spec.option.timestep = engine.physics_dt
     spec.option.iterations = engine.solver_iterations
     spec.option.ls_iterations = engine.line_search_iterations
@@ -86,21 +117,63 @@ def build_model(robot: RobotConfig, engine: EngineConfig, table: TableConfig, vi
     if not visual:
         for geom in [g for g in spec.geoms if g.group == VISUAL_GROUP]:
             spec.delete(geom)
+    return spec
+
+
+def compile_scene(spec: mujoco.MjSpec, robot: RobotConfig) -> mujoco.MjModel:
+    """The model of ``spec``, with the nominal keyframe of ``robot``.
+
+    Errors: :class:`ConfigError` for a pose that does not fit the robot's joints.
+    """
     spec.add_key(name=NOMINAL_KEY)
     model = spec.compile()
     model.key(NOMINAL_KEY).qpos[:] = _standing(model, nominal_pose(robot), robot.foot_sites)
     return model
 
 
+def _add_groups(spec: mujoco.MjSpec, robot: RobotConfig) -> None:
+    """Keep the groups of joints as tuples of the model, for :func:`pace.sim.robot_spec.joints_of`."""
+    for group, names in RobotSpec.of(robot).groups.items():
+        joint = [int(mujoco.mjtObj.mjOBJ_JOINT)] * len(names)
+        spec.add_tuple(name=group, objtype=joint, objname=list(names), objprm=[0.0] * len(names))
+
+
 def _set_motors(spec: mujoco.MjSpec, robot: RobotConfig) -> None:
+    resistances = zip(RobotSpec.of(robot).joints, joint_armature(robot), joint_friction(robot), strict=True)
+    for name, armature, friction in resistances:
+        spec.joint(name).armature = armature
+        spec.joint(name).frictionloss = friction
     for name, (kp, kd, effort) in zip(RobotSpec.of(robot).joints, joint_gains(robot).T, strict=True):
-        spec.joint(name).armature = robot.armature
         actuator = spec.actuator(name)
         if robot.stall_ratio:
             _set_line(actuator, kp, kd, joint_group(robot, name).max_speed, robot.stall_ratio * effort)
         else:
             actuator.set_to_position(kp=kp, kv=kd)
         actuator.forcerange = [-effort, effort]
+
+
+def _add_pairs(spec: mujoco.MjSpec, pairs: Sequence[Sequence[str]]) -> None:
+    """List ``pairs`` of geoms as contacts, with the scene's default friction."""
+    listed = {frozenset((pair.geomname1, pair.geomname2)) for pair in spec.pairs}
+    for pair in pairs:
+        for name in pair:
+            if spec.geom(name) is None:
+                raise ConfigError(f"robot.self_collision: the robot has no geom {name}")
+        if frozenset(pair) in listed:
+            raise ConfigError(f"robot.self_collision: {' and '.join(pair)} are a pair already")
+        listed.add(frozenset(pair))
+        spec.add_pair(geomname1=pair[0], geomname2=pair[1])
+
+
+def _count_the_world_alone(spec: mujoco.MjSpec) -> None:
+    """Sensors that count a geom's contacts count those with floor and table, the geoms of the world, and no others.
+
+    A forearm that leans on the trunk is stopped, as on the robot. It is no contact of the kind that the paper's reward
+    punishes, a fall or a hit of the table, and counting it twice, for either part, would outweigh the whole play.
+    """
+    for sensor in spec.sensors:
+        if sensor.name.endswith(TOUCH):
+            sensor.reftype, sensor.refname = mujoco.mjtObj.mjOBJ_BODY, "world"
 
 
 def _set_line(actuator: mujoco.MjsActuator, kp: float, kd: float, speed: float, stall: float) -> None:
@@ -145,6 +218,19 @@ def _fit_table(spec: mujoco.MjSpec, table: TableConfig) -> None:
         if geom is not None:  # for the eye only; a robot may do without
             geom.size[:2] = (table.paddle_radius - 0.0005, 0.001)
             geom.pos[0] = side * (table.paddle_half_thickness - 0.0007)
+
+
+def _sense_table(spec: mujoco.MjSpec, free_hand: str) -> None:
+    """Append the sensors of :data:`TABLE_FORCES`: net contact forces of the table, world frame."""
+    if free_hand and spec.body(free_hand) is None:
+        raise ConfigError(f"robot.free_hand: the robot has no body {free_hand}")
+    reported = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE)
+    for name in TABLE_FORCES if free_hand else TABLE_FORCES[:1]:
+        sensor = spec.add_sensor(name=name, type=mujoco.mjtSensor.mjSENS_CONTACT)
+        sensor.objtype, sensor.objname = mujoco.mjtObj.mjOBJ_GEOM, "table"
+        if name != TABLE_FORCES[0]:  # the hand's body and all that it carries
+            sensor.reftype, sensor.refname = mujoco.mjtObj.mjOBJ_XBODY, free_hand
+        sensor.intprm[:3] = (reported, NET_FORCE, 1)
 
 
 def _standing(model: mujoco.MjModel, pose: NDArray[np.float64], soles: Sequence[str]) -> NDArray[np.float64]:

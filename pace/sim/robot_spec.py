@@ -11,6 +11,7 @@ from functools import lru_cache
 from pathlib import Path
 
 import mujoco
+import numpy as np
 
 from pace.config.base import ConfigError
 from pace.config.sim import RobotConfig
@@ -19,6 +20,9 @@ ASSETS = Path(__file__).parent / "assets"
 #: Suffix of the sensors that count the contacts of a geom.
 TOUCH = "_touch"
 FEET = 2  # left and right
+#: Names of the sensors that :func:`pace.sim.robot.build_model` appends: force of the table (N, world frame) on the
+#: whole robot, and on its free hand if it has one.
+TABLE_FORCES = ("table_force", "free_hand_force")
 #: Groups of joints that reward terms sum over (``pace.task.state_kernels``); a robot may lack some.
 GROUPS = ("ankles", "hip_waist_left_arm", "left_shoulder_roll", "right_arm")
 PADDLE = "paddle"  # geom of the blade, a cylinder
@@ -31,7 +35,7 @@ class RobotSpec:
     Attributes:
         joints: the J actuated joints, in the order of actions, of ``qpos[7:]`` and of ``qvel[6:]``.
         arm: those of the joints between trunk and paddle, past the waist.
-        contacts: geoms other than the feet that can touch floor, table or paddle, in the order of ``body_contact``.
+        contacts: geoms other than the feet whose contacts are counted, in the order of ``body_contact``.
         paddle: site at the centre of the blade; the x axis of its link is the normal of the face.
         feet: sites at the centres of the left and the right sole.
         head: site at the middle of the head.
@@ -68,6 +72,19 @@ class RobotSpec:
             head=robot.head_site,
             groups={name: _matching(found.joints, parts) for name, parts in robot.groups.items()},
         )
+
+
+def joints_of(model: mujoco.MjModel, group: str) -> list[int]:
+    """The joints of a group of ``robot.groups``, by their places in actions and targets; none if it has no such group.
+
+    The model of :func:`pace.sim.robot.build_model` keeps each group as a tuple of its joints.
+    """
+    place = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_TUPLE, group)
+    if place < 0:
+        return []
+    first, size = model.tuple_adr[place], model.tuple_size[place]
+    joints = model.tuple_objid[first : first + size]
+    return [int(index) for index in np.flatnonzero(np.isin(model.actuator_trnid[:, 0], joints))]
 
 
 @dataclass(frozen=True)
@@ -132,6 +149,9 @@ def _check(robot: RobotConfig, found: Parts) -> None:
     unsummed = sorted(set(robot.groups) - set(GROUPS))
     if unsummed:
         raise ConfigError(f"robot.groups: no reward term sums over {', '.join(unsummed)}; known: {', '.join(GROUPS)}")
+    strange = sorted(set(robot.reset_limits) - set(found.joints))
+    if strange:
+        raise ConfigError(f"robot.reset_limits: {robot.model} has no joint {', '.join(strange)}")
     for key, parts in {"arm": robot.arm, **{f"groups.{name}": parts for name, parts in robot.groups.items()}}.items():
         unknown = [part for part in parts if not _matching(found.joints, [part])]
         if unknown:

@@ -19,9 +19,10 @@ from pace.devices import resolve_device
 from pace.sim.actuation import Actuation
 from pace.sim.ball.ball import BallParams, BallSim
 from pace.sim.ball.state import BallArrays, BallState
+from pace.sim.bodies import Bodies
 from pace.sim.engine.factory import make_engine
 from pace.sim.kinematics import Kinematics
-from pace.sim.randomization import Randomizer
+from pace.sim.randomization import Randomizer, require_bodies
 from pace.sim.robot import build_model, nominal_pose
 from pace.sim.robot_spec import RobotSpec
 from pace.sim.robot_state import RobotArrays, RobotState
@@ -98,8 +99,11 @@ class Worlds(Stateful):
         self.spec = RobotSpec.of(config.robot)
         self.generator = generator or torch.Generator(self.device).manual_seed(0)
         self.model = model or build_model(config.robot, config.engine, config.ball.table)
+        require_bodies(self.model, config.randomization)
         self.engine = make_engine(self.model, config.engine, num_worlds, self.device, config.substeps)
         self.kinematics = Kinematics(self.model, self.spec.tips, num_worlds, config.substeps, self.device)
+        hand, steps = config.robot.paddle_hand, config.substeps
+        self.bodies = Bodies(self.model, hand, num_worlds, steps, self.control_dt, self.device)
         self.ball = BallSim(
             num_worlds,
             self.device,
@@ -109,6 +113,7 @@ class Worlds(Stateful):
             config.substeps,
             config.engine.ball_dt,
             config.ball.air,
+            self.bodies.surface,
         )
         self.randomizer = Randomizer(
             config.randomization,
@@ -147,6 +152,7 @@ class Worlds(Stateful):
         path = {"qpos": qpos, "qvel": self.engine.qvel_path, "last": self.config.substeps}
         self._derive = MaskedLaunch(_derive, n, device, robot=self.robot, inverse_dt=1.0 / self.control_dt, **path)
         self._forget_impulse = MaskedLaunch(_forget_impulse, n, device, impulse=self.ball.events.paddle_impulse)
+        self._pose_bodies = self.bodies.poser(qpos, self.kinematics.paddle_path, self.ball)
         self._serve = Bound(self._record_serve, position=(n, 3), velocity=(n, 3), spin=(n, 3))
 
     def _record_serve(self, position: Tensor, velocity: Tensor, spin: Tensor) -> MaskedLaunch:
@@ -184,7 +190,7 @@ class Worlds(Stateful):
 
         Order: targets pass the actuator delay and the gears' play (:class:`pace.sim.actuation.Actuation`), pushes and
         the ball's last impulse on the paddle act, the robot moves, then the ball flies the same interval along the
-        paddle's path.
+        paths of paddle and body. Its impulse on the body does not act back.
         """
         delayed = self.actuation(targets)
         if self.randomizer.pushes_enabled:
@@ -193,6 +199,7 @@ class Worlds(Stateful):
             self._react()
         self.engine.advance(delayed, self._applied)
         self._observe()
+        self._pose_bodies()
         self.ball.fly(self.kinematics.paddle_path)
 
     def _react(self) -> None:

@@ -11,7 +11,8 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from pace.evaluation.serves import COLUMNS, C, ServeRecorder, play, wilson
+from pace.evaluation.records import COLUMNS, C, wilson
+from pace.evaluation.serves import ServeRecorder, play
 from pace.rl.policies import TaskPolicy, load_policy
 from pace.runs.metrics import markdown
 from pace.sim.robot_spec import RobotSpec

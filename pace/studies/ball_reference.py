@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from pace.config.sim import AirConfig
+from pace.config.ball import AirConfig
 from pace.sim.ball.ball import ball_preset
 
 T = TypeVar("T")

@@ -1,6 +1,6 @@
-"""The studies by name: engine parity, step sizes, solver settings, paddle reaction, motors, predictors and their error
-bounds, posture, adaptation to the paddle, on-board estimates, bf16 rounding in the update, the balls of a machine, the
-learning curves of the recipes that were tried, and the rooms of the package.
+"""The studies by name: engine parity, step sizes, solver settings, paddle reaction, motors, cost of the robots,
+ankles, predictors and their error bounds, adaptation to the paddle, on-board estimates, bf16 rounding in
+the update, the balls of a machine, the learning curves of the recipes that were tried, and the rooms of the package.
 
 They print the tables of the pages in ``docs/results`` and draw their figures.
 """
@@ -14,18 +14,19 @@ from omegaconf import DictConfig
 
 from pace.config.base import meant, parse, require
 from pace.config.commands import StudiesConfig
-from pace.rl.policies import load_predictor
+from pace.rl.policies import load_policy, load_predictor
 from pace.runs.run_folder import make_out
 from pace.studies import (
     adaptation,
+    ankles,
     architecture,
     learning_curves,
     motors,
     parity,
-    posture,
     predictor,
     reaction,
     recipe,
+    robots,
     rounding,
     senses,
     serves,
@@ -83,12 +84,16 @@ def study_solver(options: Options) -> None:
 
 def study_motors(options: Options) -> None:
     cost = motors.cost()
-    print(", ".join(f"{case} the limit {1e6 * spent:.1f} us" for case, spent in cost.items()), "a step of a world")
+    print(", ".join(f"{case} {1e6 * spent:.1f} us" for case, spent in cost.items()), "a step of a world")
     print(motors.table(motors.uses(_policies(options), options.worlds, options.serves)))
 
 
-def study_posture(options: Options) -> None:
-    print(posture.table(posture.postures(_policies(options), options.worlds, options.serves)))
+def study_robots(options: Options) -> None:
+    print(robots.table(robots.costs()))
+
+
+def study_ankles(options: Options) -> None:
+    print(ankles.table(ankles.compare(load_policy(options.run or GENERALIST), options.worlds, options.serves)))
 
 
 def study_adaptation(options: Options) -> None:
@@ -153,8 +158,9 @@ STUDIES = {
     "steps": study_steps,
     "solver": study_solver,
     "motors": study_motors,
+    "robots": study_robots,
+    "ankles": study_ankles,
     "predictor": study_predictor,
-    "posture": study_posture,
     "adaptation": study_adaptation,
     "senses": study_senses,
     "rounding": study_rounding,

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+import math
+import time
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
 
@@ -12,15 +14,18 @@ import mujoco
 import numpy as np
 import torch
 from matplotlib.figure import Figure
+from mujoco.batch import Batch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from pace.config.training import TrainConfig, load_train_config
+from pace.sim.engine.native import stop_timers
 from pace.sim.robot import build_model
 from pace.sim.robot_spec import RobotSpec
 from pace.sim.worlds import Worlds
 
 Array = NDArray[np.float64]
+COST_STEPS = 10
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")  # told apart by all kinds of vision
 #: Overrides of a saved policy's task: mixed serves without episode ends, the paper's reset, 2 ms, one thread.
 ENDLESS = (
@@ -101,3 +106,23 @@ def save_figure(file: Path, size: tuple[float, float], draw: Callable[[Figure], 
 def quantiles(values: Array) -> tuple[float, float]:
     """Median and 95 % quantile of all values."""
     return float(np.median(values)), float(np.quantile(values, 0.95))
+
+
+def native_cost(models: Mapping[str, mujoco.MjModel], worlds: int, repeats: int) -> dict[str, float]:
+    """Processor time (s) of a physics step of one world, native, one thread: the least of ``repeats`` alternations.
+
+    Standing robots whose targets jump, so that some motors saturate.
+    """
+    stop_timers()
+    batches = {case: Batch(model, worlds, 1) for case, model in models.items()}
+    least = dict.fromkeys(models, math.inf)
+    for _ in range(repeats):
+        for case, model in models.items():
+            batch, jumps = batches[case], np.random.default_rng(3).normal(0.0, 0.3, (worlds, 1, model.nu))
+            control = np.repeat(model.key_qpos[0, 7:] + jumps, COST_STEPS, axis=1)
+            batch.bind("qpos")[:], batch.bind("qvel")[:] = model.key_qpos[0], 0.0
+            batch.bind("qacc_warmstart")[:] = 0.0
+            started = time.process_time()
+            batch.rollout(COST_STEPS, control, int(mujoco.mjtState.mjSTATE_CTRL), ("qpos",))
+            least[case] = min(least[case], time.process_time() - started)
+    return {case: spent / (worlds * COST_STEPS) for case, spent in least.items()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from dataclasses import dataclass
 
@@ -46,7 +47,7 @@ class Strikes:
 def strike_all(worlds_each: int, gains: float = 1.0) -> Strikes:
     """``worlds_each`` strikes at each of SPEEDS, in the middle of random swings, on the native engine.
 
-    ``gains`` scales kp and kd of all joints from the strike on.
+    ``gains`` scales kp and kd of all joints from the strike on; at 0 the joints have no dry friction either.
     """
     count = worlds_each * len(SPEEDS)
     speed = torch.tensor(SPEEDS).repeat_interleave(worlds_each)
@@ -71,6 +72,9 @@ def strike_all(worlds_each: int, gains: float = 1.0) -> Strikes:
 def _play(count: int, speed: Tensor, reaction: bool, gains: float) -> tuple[Tensor, Worlds, dict[str, Tensor]]:
     """Swing, strike, follow through: paddle (T, N, 12) after the strike, the worlds, and the strike."""
     config = study_config(paddle_reaction=reaction)
+    if gains == 0.0:
+        groups = [dataclasses.replace(group, friction=0.0) for group in config.robot.joint_groups]
+        config = dataclasses.replace(config, robot=dataclasses.replace(config.robot, joint_groups=groups))
     worlds = standing_worlds(config, count)
     targets = smooth_swings(worlds.nominal, count, SWING_STEPS + FOLLOW_STEPS + 1, SEED, arm=0.6, rest=0.02)
     for step in range(SWING_STEPS):

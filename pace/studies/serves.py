@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from pace.config.sim import TableConfig
+from pace.config.ball import TableConfig
 from pace.config.task import SPINS
 from pace.config.training import load_train_config
 from pace.runs.metrics import markdown

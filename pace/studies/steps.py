@@ -51,11 +51,11 @@ class Deviation:
 def replay(windows: Windows, engine: dict[str, object], friction_loss: float = 0.0) -> Motion:
     """Play the windows' targets from their states with the options ``engine``; no ball, no delay.
 
-    ``friction_loss`` is a dry friction (N m) in every joint.
+    ``friction_loss`` is a dry friction (N m) added in every joint.
     """
     config = study_config(**engine)
     model = model_of(config)
-    model.dof_frictionloss[6:] = friction_loss
+    model.dof_frictionloss[6:] += friction_loss
     count = len(windows.qpos)
     robots = make_engine(model, config.engine, count, "cpu", config.substeps)
     tips = Kinematics(model, study_spec().tips, count, config.substeps, "cpu")
@@ -109,7 +109,7 @@ def solver_cases(windows: Windows, engines: tuple[str, ...] = ENGINES) -> list[C
     """Limits of the solver, cone and dry friction: each engine against its default step solved to the end."""
     full: dict[str, object] = {"solver_iterations": 100, "line_search_iterations": 50}
     default = study_config().engine
-    limits = ((2, 4), (4, 6), (6, 8), (default.solver_iterations, default.line_search_iterations), (20, 20))
+    limits = ((2, 4), (4, 6), (6, 8), (10, 10), (default.solver_iterations, default.line_search_iterations), (20, 20))
     settings: dict[str, dict[str, object]] = {
         f"{n} and {m} iterations": {"solver_iterations": n, "line_search_iterations": m} for n, m in limits
     }

@@ -63,9 +63,11 @@ def random_swings(num_worlds: int, steps: int) -> Swings:
 
 
 def policy_swings(run: Path, num_worlds: int, steps: int) -> Swings:
-    """Motions of a trained policy that plays serves, without randomisation, from a run folder or checkpoint."""
+    """Motions of a trained policy, from a run folder or checkpoint, that plays serves with the default robot, without
+    randomisation."""
     policy = load_policy(run)
-    changes = ["engine=native", f"engine.physics_dt={RECORDED_DT}", "engine.threads=1", "randomization=none"]
+    robot = f"robot={study_config().robot.name}"  # in which the studies replay them
+    changes = [robot, "engine=native", f"engine.physics_dt={RECORDED_DT}", "engine.threads=1", "randomization=none"]
     env = policy.make_env(num_worlds, "cpu", SEED, changes)
     worlds, action_scale = env.worlds, policy.config.robot.action_scale
     states, targets, ends = [], [], []

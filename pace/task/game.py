@@ -36,6 +36,7 @@ def rules_of(config: TaskConfig) -> Rules:
     rules.end_height, rules.serves_per_episode = serve.end_height, serve.serves_per_episode
     rules.min_base_height, rules.bounds_x, rules.bounds_y = reset.min_base_height, reset.bounds_x, reset.bounds_y
     rules.intercept, rules.target_x = int(reward.target_mode == "intercept"), reward.target_x
+    rules.table_push = config.ball.table.push_force
     rules.arm_offset, rules.idle_base, rules.idle_point = reward.arm_offset, reward.idle_base_xy, idle_point(reward)
     for name in ("past_x", "low_z", "falling_x"):
         setattr(rules, name, reward.nothing_to_hit[name])
@@ -52,9 +53,13 @@ class Game(GameState, Stateful):
         config: the task.
         ball: the balls that are played; their tensors are read by each call.
         base_position: (N, 3) m, of the robots; read by :meth:`close`.
+        table_force: (N, S, T, 3) N, of the tables on the robots (:class:`pace.sim.engine.base.RobotEngine`); ``None``:
+            nobody touches it.
     """
 
-    def __init__(self, config: TaskConfig, ball: BallSim, base_position: Tensor) -> None:
+    def __init__(
+        self, config: TaskConfig, ball: BallSim, base_position: Tensor, table_force: Tensor | None = None
+    ) -> None:
         count, device = ball.num_worlds, ball.device
         super().__init__(**vars(allocate(GameState, count, device)))
         self.landing_target = (config.landing_target[0], config.landing_target[1])
@@ -63,12 +68,23 @@ class Game(GameState, Stateful):
         for goal in (self.target.apex, self.target.point):
             goal.copy_(self.idle_point.expand_as(goal))
         self._seed = torch.zeros(1, dtype=torch.int32, device=device)
+        if table_force is None:
+            table_force = torch.zeros(count, 1, 1, 3, device=device)
+        self._judge = Launch(
+            referee.judge,
+            count,
+            device,
+            game=self,
+            events=ball.events,
+            ball=ball,
+            table_force=table_force,
+            rules=self.rules,
+        )
         self._record(config.serve, ball, base_position)
 
     def _record(self, config: ServeConfig, ball: BallSim, base_position: Tensor) -> None:
         count, device, forecast = ball.num_worlds, ball.device, ball.forecast_result
         given = {"game": self, "ball": ball, "forecast": forecast, "rules": self.rules}
-        self._judge = Launch(referee.judge, count, device, game=self, events=ball.events, ball=ball)
         seen = {"events": ball.events, "paddle_distance": ball.nearest_paddle_distance}
         seen |= {"radius": ball.params.radius, "base_position": base_position}
         self._close = Launch(game_kernels.close, count, device, **given, **seen)

@@ -5,7 +5,7 @@ import warp as wp
 from pace.sim.ball.state import BallArrays, EventArrays
 from pace.task.game_state import GameArrays
 from pace.task.outcome import Outcome
-from pace.task.rules import landed
+from pace.task.rules import Rules, landed, table_touch_time
 
 
 @wp.func
@@ -15,9 +15,35 @@ def _after(time: float, since: float) -> float:
     return wp.inf
 
 
+@wp.struct
+class Fault:
+    """The robot's first fault of a control step that no ball makes legal: a touch by its body, or of the table."""
+
+    time: wp.float32  # s into the step; infinite if there is none
+    outcome: wp.int32
+
+
+@wp.func
+def _fault(body: float, table: float) -> Fault:
+    fault = Fault()
+    fault.time = wp.min(body, table)
+    fault.outcome = Outcome.BODY
+    if table < body:
+        fault.outcome = Outcome.TABLE_TOUCH
+    return fault
+
+
 @wp.func
 def _judge_flight(
-    game: GameArrays, events: EventArrays, world: int, since: float, own_count: int, touches: int, dead: float, x: float
+    game: GameArrays,
+    events: EventArrays,
+    world: int,
+    since: float,
+    own_count: int,
+    touches: int,
+    dead: float,
+    fault: Fault,
+    x: float,
 ) -> int:
     """Outcome of a ball in flight after a legal hit, from what it met after ``since`` (s into the step)."""
     opponent = _after(events.opponent_bounce_time[world], since)
@@ -32,6 +58,8 @@ def _judge_flight(
     net = _after(events.net_time[world], since)
     if net < wp.inf and net <= first:
         game.referee.net_touched[world] = True
+    if _after(fault.time, since) < first:
+        return fault.outcome
     if first == wp.inf:
         return Outcome.OPEN
     if again == first and opponent > first and own > first:
@@ -50,8 +78,19 @@ def _note_touch(game: GameArrays, events: EventArrays, hit_now: bool, world: int
         game.referee.touch_time[world] = game.clock.time[world] + events.paddle_hit_time[world]
 
 
+@wp.func
+def _missed_time(events: EventArrays, before: int, touch: float, dead: float, world: int) -> float:
+    """When the ball is lost unhit: at the second of ``before`` bounces, or where it is dead before the ``touch``."""
+    missed = wp.float32(wp.inf)
+    if before >= 2:
+        missed = events.own_bounce_time[world]
+    if dead < touch:
+        missed = wp.min(missed, dead)
+    return missed
+
+
 @wp.kernel
-def judge(game: GameArrays, events: EventArrays, ball: BallArrays):
+def judge(game: GameArrays, events: EventArrays, ball: BallArrays, table_force: wp.array3d[wp.vec3], rules: Rules):
     """The referee: consume the events of one control step in the order of their times."""
     world = wp.tid()
     was_open = game.referee.outcome[world] == Outcome.OPEN
@@ -65,11 +104,16 @@ def judge(game: GameArrays, events: EventArrays, ball: BallArrays):
     elif bounce_first:
         before += 1
     dead = wp.min(events.floor_time[world], events.edge_time[world])
-    lost = before >= 2 or dead < touch
-    hit_now = was_open and not hit_before and struck and not lost and before == 1
+    missed = _missed_time(events, before, touch, dead, world)
+    lost = missed < wp.inf
+    fault = _fault(events.body_time[world], table_touch_time(table_force, rules, world))
+    at_fault = fault.time < wp.min(touch, missed)
+    hit_now = was_open and not hit_before and struck and not lost and not at_fault and before == 1
     outcome = game.referee.outcome[world]
     if was_open and not hit_before:
-        if lost:
+        if at_fault:
+            outcome = fault.outcome
+        elif lost:
             outcome = Outcome.MISS
         elif struck and before == 0:
             outcome = Outcome.VOLLEY
@@ -82,7 +126,7 @@ def judge(game: GameArrays, events: EventArrays, ball: BallArrays):
             touches -= 1
             if bounce_first:
                 own_count -= 1
-        outcome = _judge_flight(game, events, world, since, own_count, touches, dead, ball.position[world][0])
+        outcome = _judge_flight(game, events, world, since, own_count, touches, dead, fault, ball.position[world][0])
     _note_touch(game, events, hit_now, world)
     game.referee.was_open[world] = was_open
     game.referee.hit_now[world] = hit_now

@@ -190,7 +190,7 @@ class PoseSampler:
         rates = [config.roll_pitch_rate, config.roll_pitch_rate, config.yaw_rate]
         columns += columns_of(self._qvel[:, :6], [*[config.linear_velocity] * 3, *rates])
         ends = zip(*(limit.tolist() for limit in limits), strict=True)
-        ranges = _joint_ranges(config, RobotSpec.of(robot), nominal.tolist())
+        ranges = _joint_ranges(config, robot, nominal.tolist())
         columns += columns_of(self._qpos[:, 7:], [(*pair, *end) for pair, end in zip(ranges, ends, strict=True)])
         self._sample = UniformSampler(columns, generator)
         self._turn = Launch(turn, num_worlds, device, yaw=yaw, qpos=self._qpos)
@@ -205,13 +205,15 @@ class PoseSampler:
         return self._qpos, self._qvel
 
 
-def _joint_ranges(config: ResetConfig, spec: RobotSpec, nominal: list[float]) -> list[tuple[float, float]]:
+def _joint_ranges(config: ResetConfig, robot: RobotConfig, nominal: list[float]) -> list[tuple[float, float]]:
     """Lowest and highest angle of each joint at the start of an episode, rad."""
-    ranges = []
+    spec, ranges = RobotSpec.of(robot), []
     for name, angle in zip(spec.joints, nominal, strict=True):
         if name in spec.arm:
-            low, high = (angle + end for end in config.right_arm_offset)
+            ends = (angle + end for end in config.right_arm_offset)
         else:
-            low, high = (angle * end for end in config.joint_scale)
+            ends = (angle * end for end in config.joint_scale)
+        least, most = robot.reset_limits.get(name, (-math.inf, math.inf))
+        low, high = (min(max(end, least), most) for end in ends)
         ranges.append((low, high))
     return ranges

@@ -27,6 +27,7 @@ class Rules:
     past_x: float
     low_z: float
     falling_x: float
+    table_push: float  # N, mean over a control step
 
 
 @wp.func
@@ -40,6 +41,29 @@ def nothing_to_hit(position: wp.vec3, velocity: wp.vec3, rules: Rules) -> bool:
 def something_to_hit_now(game: GameArrays, ball: BallArrays, rules: Rules, world: int) -> bool:
     undecided = game.referee.outcome[world] == Outcome.OPEN and not game.referee.touched[world]
     return undecided and not nothing_to_hit(ball.position[world], ball.velocity[world], rules)
+
+
+@wp.func
+def table_touch_time(table_force: wp.array3d[wp.vec3], rules: Rules, world: int) -> float:
+    """When (s into the control step) the free hand first touches the playing surface or the robot has pushed the table;
+    infinite if it does neither.
+
+    On the top a contact's force is steeper than 45 degrees, as friction is below 1; on the sides it is flatter. A push
+    is a mean force over the control step, so that it does not depend on the physics step: the table moves once the
+    impulse is that of ``rules.table_push``.
+    """
+    steps = table_force.shape[1]
+    dt = rules.control_dt / float(steps)
+    impulse = wp.vec3()
+    for step in range(steps):
+        if table_force.shape[2] > 1:
+            hand = table_force[world, step, 1]
+            if hand[2] > wp.length(wp.vec2(hand[0], hand[1])):
+                return float(step) * dt
+        impulse += dt * table_force[world, step, 0]
+        if wp.length(impulse) > rules.table_push * rules.control_dt:
+            return float(step + 1) * dt
+    return wp.inf
 
 
 @wp.func

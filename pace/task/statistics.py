@@ -27,7 +27,7 @@ NAMES = (
 )
 
 SERVES, HITS, RIM_HITS, SUCCESSES, BAD_SERVES, FALLS, EPISODES, STEPS = (wp.constant(i) for i in range(8))
-#: Outcomes have their columns in the order of their codes, the first of which is 1.
+#: Outcomes have their columns in the order of their codes, the first of which is 1, without that of a bad serve.
 OUTCOMES = wp.constant(len(NAMES) - len(COUNTED) - 1)
 SUCCESS, BAD_SERVE = wp.constant(int(Outcome.SUCCESS)), wp.constant(int(Outcome.BAD_SERVE))
 
@@ -49,7 +49,7 @@ def _count(game: GameArrays, first_counted: wp.array[wp.float32], sums: wp.array
         wp.atomic_add(sums, BAD_SERVES, 1.0)
         return
     wp.atomic_add(sums, SERVES, 1.0)
-    wp.atomic_add(sums, OUTCOMES + outcome, 1.0)
+    wp.atomic_add(sums, OUTCOMES + wp.where(outcome > BAD_SERVE, outcome - 1, outcome), 1.0)
     if outcome == SUCCESS:
         wp.atomic_add(sums, SUCCESSES, 1.0)
     if game.referee.hit[world]:

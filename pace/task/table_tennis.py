@@ -68,7 +68,7 @@ class TableTennis:
         self._head_start = HeadStart(config.serve, worlds.ball, self.generator) if late else None
         limits = (worlds.joint_lower, worlds.joint_upper)
         self._poses = PoseSampler(config.reset, config.robot, self.num_worlds, worlds.nominal, limits, self.generator)
-        self.game = Game(config, worlds.ball, worlds.robot.base_position)
+        self.game = Game(config, worlds.ball, worlds.robot.base_position, worlds.engine.table_force)
         given = (self.game, worlds.ball, self._serves.launch[0], worlds.control_dt, self.generator)
         self._pauses = Pauses(config.serve, *given) if config.serve.has_pauses else None
         self.sensing = Sensing(

@@ -41,6 +41,8 @@ OUTCOME_NAMES = {
     Outcome.OWN_SIDE: "onto the own side",
     Outcome.DOUBLE_HIT: "hit twice",
     Outcome.VOLLEY: "hit before the bounce",
+    Outcome.BODY: "touched by the body",
+    Outcome.TABLE_TOUCH: "touched the table",
     Outcome.FALL: "fell",
     Outcome.BAD_SERVE: "a serve beside the table",
 }

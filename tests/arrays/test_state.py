@@ -43,10 +43,13 @@ STATE = {
         "paddle_tangential_restitution table_drag table_friction table_lift table_restitution "
         "table_tangential_restitution"
     ),
-    "worlds.drawn.engine": "armature_scale effort_scale friction kd_scale kp_scale trunk_com trunk_mass",
+    "worlds.drawn.engine": (
+        "ankle_effort_scale armature_scale effort_scale friction joint_damping joint_friction kd_scale kp_scale "
+        "speed_scale trunk_com trunk_mass"
+    ),
     "worlds.engine": "body_contact foot_force joint_torque qpos qpos_path qvel qvel_path warmstart",
     "worlds.event": (
-        "bounce_position edge edge_time floor floor_time hit_normal hit_offset hit_point hit_position "
+        "body body_time bounce_position edge edge_time floor floor_time hit_normal hit_offset hit_point hit_position "
         "hit_relative_velocity hit_rim hit_spin_out hit_velocity_in hit_velocity_out impulse_point net "
         "net_time opponent_bounce opponent_bounce_time own_bounce own_bounce_time paddle_hit paddle_hit_time "
         "paddle_impulse"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from copy import deepcopy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,8 @@ from tests.helpers.saved import save_run
 
 def old_config(**changes: Any) -> dict[str, Any]:
     """The default configuration as commit 43400ac saved it."""
-    config = to_dict(load_train_config())
+    config = to_dict(load_train_config(["robot=t1_paper"]))
+    config["robot"]["name"] = "t1"
     del config["out"]
     serve = {name: value for name, value in config["serve"].items() if name not in SPINS}
     config["serve"] = serve | {"spin": [0.0, 0.0]}
@@ -69,6 +71,38 @@ def test_one_range_of_spin_is_that_of_each_axis() -> None:
         override_task(load_train_config(), ["serve.spin=[0.0,1.0]"])
 
 
+@pytest.mark.parametrize("version", [2, 3])
+def test_the_robot_of_before_is_the_papers(version: int) -> None:
+    saved = old_config(curriculum=[{"samples": 1e6, "task": ["robot=t1", "robot.stall_ratio=2.0"]}])
+    for name, expected in (("t1", "t1_paper"), ("mine", "mine")):
+        saved["robot"]["name"] = name
+        new = upgrade_config(saved, version)
+        assert new["robot"] == saved["robot"] | {"name": expected}
+        assert new["curriculum"][0]["task"] == ["robot=t1_paper", "robot.stall_ratio=2.0"]
+        assert upgrade_config(saved, FORMAT) == saved
+
+
+@pytest.mark.parametrize("policy", ["pace", "wide", "campaign"])
+def test_published_policies_keep_their_robot(policy: str) -> None:
+    """All numbers as they were saved, and those of a new robot with ``robot=t1``, with its limits of the solver."""
+    saved = json.loads(Path("pretrained", policy, META).read_text())["config"]
+    config = load_policy(Path("pretrained", policy)).config
+    paper, t1 = (load_train_config([f"robot={name}"]) for name in ("t1_paper", "t1"))
+    stall_ratio = saved["robot"].get("stall_ratio", 0.0)
+    max_speed = [group.get("max_speed", 0.0) for group in saved["robot"]["joint_groups"]]
+    expected = to_dict(paper.robot) | {"stall_ratio": stall_ratio}
+    for group, speed in zip(expected["joint_groups"], max_speed, strict=True):
+        group["max_speed"] = speed
+    assert to_dict(config.robot) == expected
+    limits = ("solver_iterations", "line_search_iterations")
+    assert [getattr(config.engine, name) for name in limits] == [saved["engine"][name] for name in limits] == [10, 10]
+    changed = override_task(config, ["robot=t1"])
+    assert changed.robot == t1.robot
+    assert changed.engine == replace(config.engine, line_search_iterations=t1.engine.line_search_iterations)
+    assert t1.engine.line_search_iterations == 15
+    assert override_task(config, ["robot=t1", "engine.line_search_iterations=3"]).engine.line_search_iterations == 3
+
+
 def test_upgrades_run_in_order_and_only_where_they_are_due(monkeypatch: pytest.MonkeyPatch) -> None:
     steps = [(number, lambda state, number=number: state["seen"].append(number)) for number in (3, 2, 4)]
     monkeypatch.setattr(upgrade, "STATE_UPGRADES", steps)
@@ -78,12 +112,16 @@ def test_upgrades_run_in_order_and_only_where_they_are_due(monkeypatch: pytest.M
 
 
 def old_env(worlds: int = 3) -> dict[str, torch.Tensor]:
-    """The tensors of an environment of format 2 that the upgrades to format 3 read."""
+    """The tensors of an environment of format 2 that the upgrades read."""
     flags = torch.arange(worlds) % 2 == 0
     return {
         "sensing._line": torch.rand(worlds, 2, 8),
         "sensing._delay": torch.full((worlds,), 0.5),
         "worlds.drawn.ball.mass": torch.full((worlds,), 0.0027),
+        "worlds.drawn.engine.effort_scale": torch.full((worlds,), 0.97),
+        "worlds.event.edge": torch.zeros(worlds, dtype=torch.int32),
+        "worlds.event.edge_time": torch.full((worlds,), torch.inf),
+        "statistics.sums": torch.arange(16.0),
         "worlds.position": torch.rand(worlds, 3),
         "game.ends.over": flags,
         "game.ends.outcome": flags.int(),
@@ -103,11 +141,25 @@ def test_a_state_of_format_2_gets_what_the_true_world_keeps() -> None:
     assert env["sensing.ball_new"].all()
     assert env["env.predictor_valid"].tolist() == [True, False, True]
     assert env["worlds.drawn.ball.paddle_tangential_restitution"].tolist() == [0.0] * 3
+    assert env["worlds.drawn.engine.speed_scale"].tolist() == [1.0] * 3
+    assert env["worlds.drawn.engine.joint_friction"].tolist() == [0.0] * 3
     assert env["worlds.in_view"].all()
     assert not env["game.pause.waiting"].any()
     assert env["serves.sampled"].shape == (3, 9)
     assert env["worlds.drawn.backlash"].tolist() == [0.0] * 3
     assert env["worlds.drawn.paddle_error"].tolist() == [[0.0] * 5] * 3
+    assert env["worlds.event.body"].tolist() == [0] * 3
+    assert env["worlds.event.body_time"].isinf().all()
+    assert env["statistics.sums"].tolist() == [*range(16), 0, 0]
+
+
+@pytest.mark.parametrize("robot", ["t1", "t1_29dof"])
+def test_a_saved_robot_has_the_hands_of_its_mjcf(robot: str) -> None:
+    now = to_dict(load_train_config([f"robot={robot}"]))
+    old = deepcopy(now)
+    for key in ("paddle_hand", "free_hand"):
+        del old["robot"][key]
+    assert upgrade_config(old, 3)["robot"] == now["robot"]
 
 
 @pytest.mark.parametrize("policy", sorted(path.name for path in Path("pretrained").glob("*/")))
@@ -131,4 +183,4 @@ def test_an_old_checkpoint_is_upgraded_wherever_it_is_read(tmp_path: Path) -> No
     meta |= {"format": 1, "config": old_config()}
     (folder / META).write_text(json.dumps(meta))
     assert load_checkpoint(tmp_path).config["out"] == "runs/old"
-    check_settings(Run(tmp_path, (), 100.0))  # the same settings, but for the folder
+    check_settings(Run(tmp_path, ("robot=t1_paper",), 100.0))  # the same settings, but for the folder

@@ -104,7 +104,9 @@ def test_the_metadata_is_what_a_robot_needs(exported: tuple[Path, dict[str, floa
     resistance = np.divide(meta["max_speed"], meta["stall_torque"])
     assert resistance == pytest.approx(model.actuator_gainprm[:, 0])
     assert meta["effort"] == pytest.approx(model.actuator_forcerange[:, 1].tolist())
-    assert (meta["action_scale"], meta["control_dt"], meta["armature"]) == (0.25, 0.02, 0.01)
+    assert (meta["action_scale"], meta["control_dt"]) == (0.25, 0.02)
+    assert meta["armature"] == pytest.approx(model.dof_armature[6:].tolist())
+    assert meta["friction"] == pytest.approx(model.dof_frictionloss[6:].tolist())
     assert (meta["sensing"]["ball_position"], meta["sensing"]["mocap_delay"]) == (0.007, [0.004, 0.01])
     assert meta["actuator_delay"] == [0.0, 0.006]
     assert meta["config"]["reward"]["scale"] == 0.125  # of the run, not of configs/

@@ -17,9 +17,11 @@ from pace.config.commands import EvaluateConfig
 from pace.config.overrides import override_task
 from pace.evaluation import evaluate, sweep
 from pace.evaluation.__main__ import main
-from pace.evaluation.report import clean, text_table
-from pace.evaluation.serves import COLUMNS, C, ServeRecorder, count_failures, evaluate_row, summarise, wilson
+from pace.evaluation.records import COLUMNS, C, count_failures, summarise, wilson
+from pace.evaluation.report import clean
+from pace.evaluation.serves import ServeRecorder, evaluate_row
 from pace.evaluation.sweep import Variation, ball_presets, plan_cell, variations
+from pace.evaluation.text import text_table
 from pace.predictor.regression import BIN_NAMES
 from pace.rl.policies import built_in_policy, load_policy
 from pace.task.game import Outcome
@@ -49,7 +51,8 @@ def fake_env(worlds: int) -> SimpleNamespace:
     n = worlds
     flags = {name: torch.zeros(n, dtype=torch.bool) for name in ("serve_over", "terminated", "predictor_valid")}
     events = SimpleNamespace(
-        hit_point=torch.zeros(n, 3), hit_velocity_out=torch.zeros(n, 3), hit_rim=torch.zeros(n, dtype=torch.bool)
+        **{f"hit_{name}": torch.zeros(n, 3) for name in ("point", "velocity_out", "velocity_in", "relative_velocity")},
+        hit_rim=torch.zeros(n, dtype=torch.bool),
     )
     ball = SimpleNamespace(velocity=torch.tensor([-6.0, 0.1, 1.7]).repeat(n, 1), events=events)
     robot = SimpleNamespace(base_position=torch.tensor([-1.8, 0.3, 0.7]).repeat(n, 1))
@@ -114,6 +117,8 @@ def test_the_recorder_keeps_what_happened_to_each_counted_serve() -> None:
     step((True, True), (Outcome.SUCCESS, miss))  # warm-up: not counted
     env.worlds.ball.events.hit_point[0] = torch.tensor([-1.6, -0.2, 1.0])
     env.worlds.ball.events.hit_velocity_out[0] = torch.tensor([3.0, 0.0, 4.0])
+    env.worlds.ball.events.hit_velocity_in[0] = torch.tensor([-4.0, 0.0, 0.0])
+    env.worlds.ball.events.hit_relative_velocity[0] = torch.tensor([-5.5, 0.0, 2.0])
     env.game.returns.landing[0] = torch.tensor([1.0, 0.2, 0.78])
     env.game.returns.net_height[0] = 1.1
     env.predictor_valid[:] = torch.tensor([True, False])
@@ -127,7 +132,12 @@ def test_the_recorder_keeps_what_happened_to_each_counted_serve() -> None:
     step((True, True), (miss, miss))  # world 1 has its two serves already
     step((True, False), (miss, miss))
 
+    early = recorder.early[:-1]
+    assert early[:, C["outcome"]].tolist() == [Outcome.SUCCESS, miss]
+    assert early[:, C["ball"]].tolist() == [1.0, 1.0]
     rows = recorder.records[:-1]
+    assert rows[:, C["ball"]].tolist() == [2.0, 4.0, 2.0, 3.0]  # the third ball of world 0 missed the robot's half
+    assert float(rows[0, C["paddle_speed"]]) == pytest.approx(2.5)
     assert recorder.counted.tolist() == [2, 2]
     assert recorder.bad.tolist() == [1, 0]
     assert rows[:, C["outcome"]].tolist() == [Outcome.SUCCESS, miss, Outcome.FALL, miss]
@@ -169,7 +179,8 @@ def test_failures_add_up_and_the_rim_takes_its_own() -> None:
     ]
     counts = count_failures(records(outcomes, rim=(len(outcomes) - 2, len(outcomes) - 1)))
     assert counts == {
-        "miss": 1, "net": 1, "out": 1, "own_side": 1, "rim": 1, "double_hit": 1, "volley": 1, "fall": 1,
+        "miss": 1, "net": 1, "out": 1, "own_side": 1, "rim": 1, "double_hit": 1, "volley": 1,
+        "body": 1, "table_touch": 1, "fall": 1,
     }  # fmt: skip
 
 
@@ -225,15 +236,19 @@ def test_the_command_writes_what_it_says(
     sweep = ["--sweep", "sweep_rows=[short]", "sweep_serves=2", "variations.ball=[venue]", "variations.engine=[native]"]
     sweep += ["reality=null"]
     small = ["rows=[mixed]", "serves=4", "num_worlds=2", "warmup_serves=0", "physics_dt=0.02", "progress=false"]
-    small += ["ball=paper", "serve.max_duration=0.9"]
+    small += ["ball=paper", "serve.max_duration=0.9", "first_ball=[0.0,0.1]", "first_ball_worlds=2"]
     assert run_main(monkeypatch, str(run), f"out={out}", "device=cpu", *small, *sweep, *few) == 0
     printed = capsys.readouterr().out
     names = {"evaluation.json", "evaluation.csv", "evaluation.md", "serves.csv", "sweep.json", "sweep.png"}
-    names |= {"strike_map.png", "landing_map.png", "footwork.png"}
+    names |= {"strike_map.png", "landing_map.png", "footwork.png", "by_ball.png"}
     assert {file.name for file in out.iterdir()} == names
     assert all(f"wrote {out / name}" in printed for name in names)
     assert "97.6" in printed  # the paper's hit rate stands beside ours
-    assert "| mixed | 4 |" in (out / "evaluation.md").read_text()
+    page = (out / "evaluation.md").read_text()
+    assert "| mixed | 4 |" in page
+    assert "| ball | 1 | 2 |" in page
+    assert "| 0.1 | 2 |" in page
+    assert "| height of the base, cm: mean (5 to 95 %) of nominal |" in page
     check_files(out, run)
 
 
@@ -253,10 +268,15 @@ def check_files(out: Path, run: Path) -> None:
     assert len(lines) == 1
     assert float(lines[0]["failures/miss"]) == row["failures"]["miss"]
     assert len((out / "serves.csv").read_text().splitlines()) == 5
+    assert [group["serves"] for group in content["by_ball"]["mixed"]] == [2, 2]
+    first = content["first_ball"]
+    assert (first["serve"], first["ball"], [row["wait"] for row in first["rows"]]) == ("mixed", "lies", [0.0, 0.1])
+    assert content["quality"]["mixed"]["height"]["nominal"] == pytest.approx(0.664583)
+    assert content["quality"]["mixed"]["thresholds"]["calm_speed"] == 1.0
     cells = json.loads((out / "sweep.json").read_text())["cells"]
     assert [cell["kind"] for cell in cells] == ["as given", "ball", "engine"]
     assert cells[0]["rows"] == cells[2]["rows"]  # auto is native on a CPU: the same cell
-    for name in ("strike_map.png", "landing_map.png", "footwork.png", "sweep.png"):
+    for name in ("strike_map.png", "landing_map.png", "footwork.png", "by_ball.png", "sweep.png"):
         assert (out / name).read_bytes().startswith(b"\x89PNG")
 
 
@@ -268,6 +288,10 @@ def check_files(out: Path, run: Path) -> None:
         (("policy=best",), 2, "run, zero or random"),
         (("policy=zero", "rows=[lob]"), 2, "lob"),
         (("policy=zero", "ball=wood"), 2, "wood"),
+        (("policy=zero", "first_ball=[-1.0]"), 2, "first_ball must not hold negative"),
+        (("policy=zero", "first_ball_kind=rolls"), 2, "carried, hidden, lies"),
+        (("policy=zero", "first_ball_serve=lob"), 2, "lob"),
+        (("policy=zero", "quality.calm_speed=0"), 2, "quality.calm_speed must be positive"),
         (("policy=zero", "serves=0"), 2, "serves must be at least 1"),
         (("policy=zero", "rows=[]"), 2, "at least one serve range"),
         (("policy=zero", "physics_dt=0.003"), 2, "must divide"),

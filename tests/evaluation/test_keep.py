@@ -64,10 +64,29 @@ def test_the_card_says_what_it_is_and_how_to_play_its_table(tmp_path: Path) -> N
     assert "| last command | `python -m pace.rl.train experiment=generalist` |" in text
     assert "| versions | torch 2.13.0 |" in text
     assert "\nIt limps.\n" in text
-    command = "physics_dt=0.002 num_worlds=256 warmup_serves=2 seed=1 serves=5120 sensing=paper"
+    command = "task=own physics_dt=0.002 num_worlds=256 warmup_serves=2 seed=1 serves=5120 sensing=paper"
     assert f"`python -m pace.evaluation pretrained/mine {command}`" in text
     assert "| mid-long | 5,120 | 99.5 (99.1 to 99.7) | 97.1 (96.5 to 97.6) | 0.4 |" in text
     assert "Robustness sweep" not in text
+    assert "Quality of play" not in text  # an older evaluation
+
+
+def test_the_card_has_all_tables_of_the_evaluation(tmp_path: Path) -> None:
+    run = save_run(tmp_path / "run")
+    falls = {"falls_waiting_per_1000": 1.5, "falls_waiting_per_1000_low": 0.4, "falls_waiting_per_1000_high": None}
+    first = {"serve": "mid_long", "ball": "hidden", "rows": [{**ROW, "wait": 3.0, "robots": 512, **falls}]}
+    groups = [{**ROW, "balls": "1", "first": 1, "last": 1}, {**ROW, "balls": "20+", "first": 20, "last": 22}]
+    content = {**EVALUATED, "by_ball": {"mid_long": groups, "short": groups[1:]}, "first_ball": first}
+    (tmp_path / "evaluation.json").write_text(json.dumps(content))
+    (tmp_path / "by_ball.png").write_bytes(b"picture")
+    keep(run, tmp_path / "mine", tmp_path)
+    text = (tmp_path / "mine" / "README.md").read_text()
+    assert "| ball | 1 | 20+ |" in text
+    assert "| mid_long, success % | 97.1 (96.5 to 97.6) | 97.1 (96.5 to 97.6) |" in text
+    assert "| short, hit % | - | 99.5 (99.1 to 99.7) |" in text
+    assert "(mid-long serves; until then the ball is out of view)" in text
+    assert "| 3 | 512 | 99.5 | 99.1 to 99.7 | 97.1 | 96.5 to 97.6 | 1.5 | 0.4 to - |" in text
+    assert (tmp_path / "mine" / "by_ball.png").read_bytes() == b"picture"
 
 
 @pytest.mark.parametrize("case", ["no run", "no evaluation", "no notes"])

@@ -77,14 +77,14 @@ def fake_worlds(n: int) -> Any:
     return SimpleNamespace(
         num_worlds=n, device=CPU, control_dt=0.02, robot=fake_robot(n), ball=fake_ball(n),
         nominal=torch.linspace(-0.5, 0.5, 21), joint_lower=torch.full((21,), -1.0),
-        joint_upper=torch.full((21,), 1.0), spec=SPEC,
+        joint_upper=torch.full((21,), 1.0), spec=SPEC, engine=SimpleNamespace(table_force=torch.zeros(n, 2, 2, 3)),
     )  # fmt: skip
 
 
 def fake_game(n: int = 1, task: TaskConfig | None = None) -> tuple[Game, Any]:
     """A game in the middle of a playable serve, and its worlds."""
     worlds = fake_worlds(n)
-    game = Game(task or config(), worlds.ball, worlds.robot.base_position)
+    game = Game(task or config(), worlds.ball, worlds.robot.base_position, worlds.engine.table_force)
     game.start_serve(torch.ones(n, dtype=torch.bool))
     return game, worlds
 

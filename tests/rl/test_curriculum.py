@@ -42,11 +42,15 @@ def test_each_stage_changes_the_task_of_the_one_before() -> None:
 
 def test_the_generalists_stages_are_tasks() -> None:
     tasks = stage_tasks(load_train_config(["experiment=generalist"]))
-    assert [task.reward.terms["ready_stance"].weight for task in tasks] == [0.0, *3 * [10.0]]
-    assert [task.sensing.name for task in tasks] == ["paper", "paper", *2 * ["wide"]]
-    assert [task.randomization.trunk_mass for task in tasks] == [*2 * [[-2.0, 2.0]], *2 * [[-4.0, 6.0]]]
-    assert [task.serve.serves_per_episode for task in tasks] == [5, 5, 5, 20]
-    assert [task.reward.terms["return_velocity"].params["time"] for task in tasks] == [*3 * [0.5], 0.56]
+    assert [task.serve.name for task in tasks] == [*4 * ["train"], "machine"]
+    assert [task.serve.pause[1] for task in tasks] == [0.0, *3 * [1.0], 3.0]
+    assert [task.serve.first_pause[1] for task in tasks] == [0.0, *3 * [1.5], 4.0]
+    assert [task.sensing.name for task in tasks] == [*3 * ["paper"], *2 * ["mocap"]]
+    assert [task.reward.terms["ready_stance"].weight for task in tasks] == [0.0, 0.0, *3 * [10.0]]
+    assert [task.randomization.trunk_mass for task in tasks] == [*3 * [[-2.0, 2.0]], *2 * [[-4.0, 6.0]]]
+    assert [task.randomization.actuator_delay[1] for task in tasks] == [*3 * [0.006], 0.015, 0.025]
+    assert [task.serve.serves_per_episode for task in tasks] == [*4 * [5], 20]
+    assert (tasks[-1].robot.name, tasks[-1].ball.name, tasks[-1].serve.topspin) == ("t1", "rubber", [-60.0, 60.0])
 
 
 def test_worlds_are_made_when_a_stage_begins() -> None:

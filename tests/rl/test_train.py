@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import os
+import shutil
+import signal
 import sys
 from pathlib import Path
 
 import pytest
 import torch
 
+from pace.rl.policies import load_policy
 from pace.rl.train import main
+from pace.rl.trainer import Trainer
 from pace.runs.checkpoint import load_checkpoint
 from pace.runs.metrics import read_metrics
 
@@ -137,3 +142,75 @@ def test_a_folder_that_cannot_be_made_is_one_line(train, tmp_path: Path, capsys:
     (tmp_path / "file").touch()
     assert real_run(train, tmp_path / "file" / "run", 1) == 2
     assert "cannot be made: Not a directory" in capsys.readouterr().err
+
+
+def snapshot(folder: Path) -> dict[str, bytes]:
+    """All files in a folder."""
+    return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+
+def test_a_colleagues_checkpoint_is_resumed_into_a_new_run(
+    train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Bit for bit as the run itself would have continued; nothing that lies around it is touched."""
+    monkeypatch.chdir(tmp_path)
+    assert real_run(train, tmp_path / "theirs", 1, "checkpoint_minutes=0", "name=theirs") == 0
+    mine = tmp_path / "project" / "checkpoints"  # as if it were a run
+    mine.mkdir(parents=True)
+    shutil.copytree(tmp_path / "theirs" / "checkpoints" / "update_00000001", mine / "update_00000001")
+    shutil.copytree(mine / "update_00000001", tmp_path / "project" / "from_colleague")
+    (tmp_path / "project" / "config.yaml").write_text("my: own settings\n")
+    (tmp_path / "project" / "metrics.csv").write_text("day,weight\n1,70\n")
+    before = snapshot(tmp_path / "project")
+    limits = (f"samples={2 * UPDATE}", "progress=false")
+    assert train(f"resume={tmp_path / 'project' / 'from_colleague'}", *limits) == 0
+    assert train(f"resume={mine / 'update_00000001'}", *limits, "out=second") == 0
+    assert train(f"resume={tmp_path / 'theirs'}", *limits, "out=third") == 0
+    assert snapshot(tmp_path / "project") == before
+    assert [path.name for path in (tmp_path / "theirs" / "checkpoints").iterdir()] == ["update_00000001"]
+    assert real_run(train, tmp_path / "theirs", 2, "name=theirs") == 2  # its own folder: resume continues it
+    assert train(f"resume={tmp_path / 'theirs'}", *limits) == 0
+    expected = load_checkpoint(tmp_path / "theirs")
+    (new,) = (tmp_path / "runs").iterdir()
+    assert new.name.endswith("_theirs")
+    for run in (new, Path("second"), Path("third")):
+        found = load_checkpoint(run)
+        assert found.config["out"] == str(run.relative_to(tmp_path) if run.is_absolute() else run)
+        assert found.counters["updates"] == 2
+        for part, tensors in expected.weights.items():
+            assert all(torch.equal(tensor, found.weights[part][name]) for name, tensor in tensors.items())
+        assert read_metrics(run / "metrics.csv")["update"] == [2]
+    capsys.readouterr()
+    assert load_policy("project/from_colleague").counters["updates"] == 1
+    assert real_run(train, tmp_path / "begun", 1, "init_from=project/from_colleague") == 0
+
+
+def test_a_run_that_is_copied_resumes_where_it_lies(train, tmp_path: Path) -> None:
+    assert real_run(train, tmp_path / "a", 1) == 0
+    shutil.copytree(tmp_path / "a", tmp_path / "b")
+    assert train(f"resume={tmp_path / 'b' / 'checkpoints' / 'update_00000001'}", f"samples={2 * UPDATE}") == 0
+    assert load_checkpoint(tmp_path / "b").counters["updates"] == 2
+    assert load_checkpoint(tmp_path / "a").counters["updates"] == 1
+
+
+def test_a_run_without_an_end_says_so_and_ends_with_ctrl_c(
+    train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("pace.runs.progress.SECONDS_PER_LINE", 0.0)
+    update, count = Trainer.update, 0
+
+    def stopped(self: Trainer) -> dict[str, float]:
+        nonlocal count
+        count += 1
+        if count == 3:
+            os.kill(os.getpid(), signal.SIGINT)
+        return update(self)
+
+    monkeypatch.setattr(Trainer, "update", stopped)
+    small = [argument for argument in SMALL if not argument.startswith("progress")]
+    assert train(f"num_worlds={WORLDS}", "samples=inf", "minutes=0", f"out={tmp_path}", *small) == 0
+    printed = capsys.readouterr().out
+    assert "--:-- left" in printed
+    assert "stopped by SIGINT: 3 updates" in printed
+    assert load_checkpoint(tmp_path).counters["updates"] == 3
+    assert load_checkpoint(tmp_path).config["samples"] == float("inf")

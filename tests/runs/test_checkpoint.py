@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -15,6 +18,7 @@ from pace.runs.checkpoint import (
     WEIGHTS,
     Checkpoint,
     CheckpointError,
+    clear_leftovers,
     export_weights,
     find_checkpoint,
     flatten_tensors,
@@ -23,6 +27,7 @@ from pace.runs.checkpoint import (
     load_weights,
     prune_checkpoints,
     save_checkpoint,
+    update_of,
 )
 
 
@@ -153,3 +158,80 @@ def test_export_keeps_weights_only(saved: Path, tmp_path: Path) -> None:
     assert not (folder / TRAINING).exists()
     assert loaded.config == example().config
     assert loaded.weights["agent"]["count"].dtype == torch.float32
+
+
+def test_copies_beside_the_checkpoints_are_the_users(saved: Path) -> None:
+    run, folder = saved.parent.parent, saved.parent
+    names = ["update_00000099_copy", "update_00000098 (copy)", "update_9", "best", "update_0000010x", "Update_00000097"]
+    for name in names:
+        shutil.copytree(saved, folder / name)
+    (folder / "update_00000003").symlink_to(folder / "best")
+    noted = save_checkpoint(folder / "update_00000004", example())
+    (noted / "notes.md").write_text("the good one")
+    newest = save_checkpoint(folder / "update_123456789", example())
+    assert find_checkpoint(run) == newest
+    assert [update_of(path) for path in list_checkpoints(run)] == [3, 4, 7, 123456789]
+    prune_checkpoints(run, keep=1)
+    left = {"update_00000003", "update_00000004", "update_123456789", *names}
+    assert {path.name for path in folder.iterdir()} == left
+    assert (noted / "notes.md").read_text() == "the good one"
+    assert load_checkpoint(folder / "best").counters["updates"] == 7
+    for path in list_checkpoints(run):
+        (path / META).unlink()
+    with pytest.raises(CheckpointError, match=r"checkpoints/ holds Update_00000097, .*: name one of them"):
+        find_checkpoint(run)
+
+
+def test_what_a_kill_has_left_is_removed_or_put_back(saved: Path) -> None:
+    run, folder = saved.parent.parent, saved.parent
+    shutil.copytree(saved, folder / ".update_00000009.41.old")  # killed between the two renames of a replacement
+    shutil.copytree(saved, folder / ".update_00000007.42.old")
+    (folder / ".update_00000010.43.tmp").mkdir()
+    (folder / ".update_00000010.43.tmp" / WEIGHTS).write_bytes(b"half")
+    (run / ".last_good.44.tmp").mkdir()
+    for mine in (folder / ".mine.45.tmp", folder / ".update_00000011.46.tmp"):
+        mine.mkdir()
+        (mine / "thesis.txt").write_text("mine")
+    clear_leftovers(run)
+    assert [path.name for path in list_checkpoints(run)] == ["update_00000007", "update_00000009"]
+    hidden = {path.name for place in (run, folder) for path in place.glob(".*")}
+    assert hidden == {".mine.45.tmp", ".update_00000011.46.tmp"}
+
+
+def test_a_replaced_checkpoint_keeps_what_a_user_has_put_into_it(saved: Path) -> None:
+    (saved / "notes.md").write_text("mine")
+    save_checkpoint(saved, example(5.0))
+    assert load_checkpoint(saved).weights["agent"]["w"][0, 0].item() == 5.0
+    assert [file.read_text() for file in saved.parent.glob(".*/notes.md")] == ["mine"]
+
+
+@pytest.mark.parametrize("at", [0, 1, 2, 3, 4, 5])
+def test_a_checkpoint_that_cannot_be_written_leaves_what_was_there(
+    saved: Path, at: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The disk fills up at each flush in turn: of the three files, the folder, and (once the new one is in place) of
+    the folder around it."""
+    left = at
+
+    def fsync(handle: int) -> None:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    if at < 5:
+        with pytest.raises(CheckpointError, match="update_00000007 cannot be written: No space left on device"):
+            save_checkpoint(saved, example(5.0))
+    else:
+        save_checkpoint(saved, example(5.0))
+    value = load_checkpoint(saved).weights["agent"]["w"][0, 0].item()
+    assert value == (1.0 if at < 4 else 5.0)
+    clear_leftovers(saved.parent.parent)
+    assert [path.name for path in saved.parent.iterdir()] == [saved.name]
+
+
+def test_a_path_that_cannot_be_read_is_one_line(tmp_path: Path) -> None:
+    for path in ("x" * 300, "a\0b"):
+        with pytest.raises(CheckpointError, match=r"cannot be read|does not exist"):
+            find_checkpoint(path)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -14,6 +16,36 @@ from pace.runs.run_folder import RunFolder, make_out
 from pace.studies.__main__ import main as studies
 from pace.studies.ablate import main as ablate
 from tests.helpers.outside import SMALL, command
+
+
+def test_commands_of_one_second_get_folders_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(time, "strftime", lambda _: "2026-01-01_00-00-00")
+    with ThreadPoolExecutor(16) as pool:
+        folders = list(pool.map(lambda _: make_out(None, "pace"), range(32)))
+    assert sorted(folder.name for folder in folders) == sorted(
+        ["2026-01-01_00-00-00_pace", *(f"2026-01-01_00-00-00_pace_{number}" for number in range(2, 33))]
+    )
+
+
+@pytest.mark.parametrize("out", ["a\0b", "x" * 300])
+def test_a_name_that_no_folder_can_have_is_one_line(out: str) -> None:
+    with pytest.raises(ConfigError, match="cannot be made"):
+        make_out(out, "x")
+    with pytest.raises(ConfigError, match="out=runs cannot be made"):
+        make_out(None, out)
+
+
+def test_a_run_that_cannot_start_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert command(train, *SMALL, "randomization.trunk_mass=[-20,-20]") == 2
+    assert command(train, *SMALL, "randomization.trunk_mass=[-20,-20]", "out=given") == 2
+    assert list((tmp_path / "runs").iterdir()) == []
+    assert not (tmp_path / "given").exists()
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("mine")
+    assert command(train, *SMALL, "randomization.trunk_mass=[-20,-20]", "out=mine") == 2
+    assert (tmp_path / "mine" / "notes.txt").read_text() == "mine"
 
 
 def test_a_folder_is_made_and_nothing_is_left_in_it(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ import pytest
 
 from pace.config.base import ConfigError, to_dict
 from pace.config.training import load_train_config
+from pace.config.upgrade import FORMAT
 from pace.runs import queue as run_queue
 from pace.runs.queue import Run, RunQueue, check_settings, logged_samples, shares_of_cores
 
@@ -119,7 +120,7 @@ def test_a_run_of_other_settings_is_not_taken_up(tmp_path: Path) -> None:
     )
     checkpoint = run.folder / "checkpoints" / "update_00000001"
     checkpoint.mkdir(parents=True)
-    meta = {"format": 1, "config": there, "counters": {"samples": 50}, "weights": {}, "training": None}
+    meta = {"format": FORMAT, "config": there, "counters": {"samples": 50}, "weights": {}, "training": None}
     (checkpoint / "checkpoint.json").write_text(json.dumps(meta))
     check_settings(run)  # limits and the number of processes are free
     with pytest.raises(ConfigError, match=r"baseline_seed1 was trained with algo\.gamma 0\.98, and 0\.9 is asked for"):

@@ -38,7 +38,7 @@ def test_a_saved_policy_is_evaluated_with_them(
     monkeypatch.chdir(folder.parent)
     run = str(save_run(tmp_path / "run"))
     table = ("rows=[lob]", "serves=4", "num_worlds=4", "physics_dt=0.01", "engine.threads=1", "progress=false")
-    chosen = (*table, "ball=heavy", f"out={tmp_path / 'table'}")
+    chosen = (*table, "ball=heavy", "first_ball=[]", f"out={tmp_path / 'table'}")
     assert command(evaluate, run, "--config-dir", folder.name, *chosen) == 0
     written = json.loads((tmp_path / "table" / "evaluation.json").read_text())
     assert [row["serve"] for row in written["rows"]] == ["lob"]

@@ -12,7 +12,8 @@ from pace.config.base import ConfigError, to_dict
 from pace.config.training import load_train_config
 from pace.config.upgrade import LANDING_TARGET, upgrade_config
 from pace.evaluation.__main__ import main as evaluate
-from pace.evaluation.serves import COLUMNS, evaluate_row
+from pace.evaluation.records import COLUMNS
+from pace.evaluation.serves import evaluate_row
 from pace.rl.policies import load_policy
 from pace.rl.train import main as train
 from pace.task.outcome import Outcome
@@ -24,6 +25,7 @@ def test_a_policy_trained_without_the_term_is_evaluated(tmp_path: Path) -> None:
     run, out = tmp_path / "run", tmp_path / "table"
     assert command(train, f"out={run}", "~reward.terms.predicted_landing", *SMALL) == 0
     table = ("rows=[short]", "serves=4", "num_worlds=4", "engine.threads=1", "progress=false", "physics_dt=0.01")
+    table += ("first_ball=[]",)
     assert command(evaluate, str(run), f"out={out}", *table) == 0
     assert json.loads((out / "evaluation.json").read_text())["rows"][0]["serves"] == 4
     assert (out / "landing_map.png").exists()

@@ -76,7 +76,7 @@ def test_its_policy_plays_and_is_evaluated(folder: Path, run: Path) -> None:
     assert columns.stop - columns.start == JOINTS
     assert bool(env.policy_observation.isfinite().all())
     table = ("rows=[mixed]", "serves=2", "num_worlds=2", "warmup_serves=0", "physics_dt=0.01", "progress=false")
-    assert command(evaluate, str(run), f"out={folder / 'table'}", "engine.threads=1", *table) == 0
+    assert command(evaluate, str(run), f"out={folder / 'table'}", "engine.threads=1", "first_ball=[]", *table) == 0
     assert json.loads((folder / "table" / "evaluation.json").read_text())["rows"][0]["serves"] >= 2
 
 

@@ -10,13 +10,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from pace.config.sim import BallConfig
+from pace.config.ball import BallConfig
+from pace.config.base import ConfigError
 from pace.config.training import TrainConfig, load_train_config
 from pace.sim.ball.ball import ball_preset
 from pace.sim.randomization import BALL_LIMITS, SAMPLED_BALL_PARAMS
+from pace.sim.robot import joint_armature, joint_gains, motor_lines
 from pace.sim.worlds import Worlds
 from pace.studies.ball_reference import measured_drag, measured_lift
 from pace.studies.ball_trials import PRESETS
+from tests.helpers.robot import JOINT_NAMES
 
 WORLDS = 3
 EVERY = torch.ones(WORLDS, dtype=torch.bool)
@@ -26,6 +29,21 @@ SLIPS = np.linspace(0.0, 12.0, 16)  # m/s at the paddle: strikes, with the spin 
 FLYING = np.linspace(3.5, 8.0, 10)  # m/s, serves and returns
 MEASURED_DRAG = measured_drag(FLYING, np.zeros(10))
 MEASURED_LIFT = 8 / 3 * measured_lift(FLYING, np.full(10, 30.0))  # C_L over S, at the spin that a bounce gives
+#: What the sources of configs/robot/t1.yaml say of a motor, by part of its joint's name: efforts (N m), no-load speeds
+#: (rad/s) and armatures (kg m^2); t1_paper's are read from its file.
+SOURCES = {
+    "Shoulder_Pitch": ((18,), (18, 7.33), (0.05, 0.0283)),
+    "Shoulder_Roll": ((18,), (18, 7.33), (0.0283,)),
+    "Elbow_Pitch": ((18,), (18, 7.33), (0.05, 0.0283)),
+    "Elbow_Yaw": ((18,), (18, 7.33), (0.0283,)),
+    "Waist": ((25,), (7.1, 12.57), (0.0478,)),
+    "Hip_Pitch": ((45,), (15.2, 16.76), (0.0524,)),
+    "Hip_Roll": ((25,), (7.1, 12.57), (0.0478,)),
+    "Hip_Yaw": ((25,), (7.1, 12.57), (0.0478,)),
+    "Knee": ((60,), (14.7, 12.57), (0.0636,)),
+    "Ankle_Pitch": ((24,), (12.9, 18.8), (0.05, 0.068)),
+    "Ankle_Roll": ((15,), (12.9, 12.4), (0.05, 0.068)),
+}
 
 
 @lru_cache
@@ -68,6 +86,25 @@ def test_wide_covers_every_preset(preset: str) -> None:
         restitution, slope = (getattr(ball, f"{surface}_restitution{end}") for end in ("", "_slope"))
         own_slope = getattr(rubber, f"{surface}_restitution_slope")
         assert_covered(f"{surface}_restitution", restitution - slope * speeds, -own_slope * speeds)
+
+
+def motors(name: str) -> dict[str, np.ndarray]:
+    """Effort, no-load speed and armature (J,) of a robot of configs/robot."""
+    robot = load_train_config([f"robot={name}"]).robot
+    lines = motor_lines(robot)
+    assert lines is not None
+    return {"effort": joint_gains(robot)[2], "speed": lines[0], "armature": joint_armature(robot)}
+
+
+def test_wide_covers_every_source_of_the_motors() -> None:
+    ranges, t1, paper = wide_config().randomization, motors("t1"), motors("t1_paper")
+    for index, joint in enumerate(JOINT_NAMES):
+        source = next(numbers for part, numbers in SOURCES.items() if part in joint)
+        for (name, nominal), known in zip(t1.items(), source, strict=True):
+            low, high = (nominal[index] * end for end in getattr(ranges, f"{name}_scale"))
+            assert nominal[index] in known
+            for value in (*known, paper[name][index]):
+                assert low <= value <= high, (joint, name, value)
 
 
 def test_wide_keeps_friction_positive() -> None:
@@ -174,3 +211,16 @@ def test_a_reset_resamples_its_world_alone(engine: str) -> None:
     (robot, ball), (new_robot, new_ball) = seen
     assert_only_world_1_changed(robot, new_robot, 1e-2)
     assert_only_world_1_changed(ball, new_ball, 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("randomization.trunk_mass=[-20,2]", r"randomization.trunk_mass: with -20 kg nothing is left of the trunk's"),
+        ("randomization.paddle_restitution=[-1,-0.9]", r"paddle_restitution with this ball gives \[-0.122, -0.022\]"),
+        ("randomization.table_friction=[-9,-8]", r"table_friction with this ball gives \[-8.75, -7.75\]"),
+    ],
+)
+def test_a_body_that_cannot_be_is_refused(override: str, words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        Worlds(load_train_config([override]), 1, "cpu")

@@ -1,6 +1,7 @@
 """The model against the maker's description of T1, the table and the configuration."""
 
 import dataclasses
+import math
 
 import mujoco
 import numpy as np
@@ -8,10 +9,19 @@ import pytest
 
 from pace.config.base import ConfigError
 from pace.config.training import load_train_config
-from pace.sim.robot import NOMINAL_KEY, build_model, joint_gains, nominal_pose
+from pace.sim.robot import (
+    NOMINAL_KEY,
+    build_model,
+    joint_armature,
+    joint_friction,
+    joint_gains,
+    motor_lines,
+    nominal_pose,
+)
 from tests.helpers.robot import CONTACT_BODIES, JOINT_NAMES
 
-#: joint: (lower, upper, effort) in rad and N m, from the maker's description; every other joint mirrors its sibling.
+#: joint: (lower, upper, effort of t1_paper) in rad and N m, from the maker's description; every other
+#: joint mirrors its sibling.
 LIMITS = {
     "Left_Shoulder_Pitch": (-3.31, 1.22, 18),
     "Left_Shoulder_Roll": (-1.74, 1.57, 18),
@@ -35,6 +45,18 @@ LIMITS = {
     "Right_Ankle_Pitch": (-0.87, 0.35, 20),
     "Right_Ankle_Roll": (-0.44, 0.44, 15),
 }
+#: Of t1, by part of the joint's name: effort (N m), max_speed (rad/s), armature (kg m^2), friction (N m).
+NEWEST = {
+    "Shoulder": (18, 18, 0.0283, 0.5),
+    "Elbow": (18, 18, 0.0283, 0.5),
+    "Waist": (25, 7.1, 0.0478, 0.46),
+    "Hip_Pitch": (45, 15.2, 0.0524, 0.49),
+    "Hip_Roll": (25, 7.1, 0.0478, 0.88),
+    "Hip_Yaw": (25, 7.1, 0.0478, 0.24),
+    "Knee": (60, 14.7, 0.0636, 1.0),
+    "Ankle_Pitch": (24, 12.9, 0.068, 0.72),
+    "Ankle_Roll": (15, 12.9, 0.068, 0.21),
+}
 LINK_MASSES = {
     "Trunk": 11.7,
     "H1": 0.44391,
@@ -50,9 +72,9 @@ LINK_MASSES = {
 }
 
 
-@pytest.fixture(scope="module")
-def config():
-    return load_train_config()
+@pytest.fixture(scope="module", params=["t1", "t1_paper"])
+def config(request):
+    return load_train_config([f"robot={request.param}"])
 
 
 @pytest.fixture(scope="module")
@@ -80,12 +102,30 @@ def test_paddle_link_has_the_inertia_of_the_variant(model):
     np.testing.assert_allclose(np.abs(axis), [1, 0, 0], atol=1e-12)
 
 
-def test_joints_are_the_21_in_order_with_their_limits(model):
+def test_joints_are_the_21_in_order_with_their_limits(config, model):
     assert tuple(model.joint(i).name for i in range(1, model.njnt)) == JOINT_NAMES == tuple(LIMITS)
     assert tuple(model.actuator(i).name for i in range(model.nu)) == JOINT_NAMES
-    for index, (lower, upper, effort) in enumerate(LIMITS.values()):
+    for index, (name, (lower, upper, effort)) in enumerate(LIMITS.items()):
+        if config.robot.name == "t1":
+            effort = next(numbers[0] for part, numbers in NEWEST.items() if part in name)
         np.testing.assert_allclose(model.jnt_range[1 + index], [lower, upper])
         np.testing.assert_allclose(model.actuator_forcerange[index], [-effort, effort])
+
+
+def test_motors_armature_and_friction_reach_each_joint(config, model):
+    of_joint = [next(numbers for part, numbers in NEWEST.items() if part in name) for name in JOINT_NAMES]
+    _, speed, armature, friction = np.array(of_joint).T
+    if config.robot.name == "t1_paper":
+        armature, friction = np.full(21, 0.01), np.zeros(21)
+    else:
+        lines = motor_lines(config.robot)
+        assert lines is not None
+        np.testing.assert_allclose(lines[0], speed)
+    np.testing.assert_allclose(joint_armature(config.robot), armature)
+    np.testing.assert_allclose(model.dof_armature[6:], armature)
+    np.testing.assert_allclose(joint_friction(config.robot), friction)
+    np.testing.assert_allclose(model.dof_frictionloss[6:], friction)
+    assert not model.dof_frictionloss[:6].any()
 
 
 def test_head_is_rigid_with_the_trunk(model):
@@ -95,7 +135,10 @@ def test_head_is_rigid_with_the_trunk(model):
 
 
 def test_gains_and_solver_come_from_the_configuration(config):
-    groups = [dataclasses.replace(g, kp=2 * g.kp, kd=3 * g.kd, effort=g.effort / 2) for g in config.robot.joint_groups]
+    changes = [{"kp": 2 * g.kp, "kd": 3 * g.kd, "effort": g.effort / 2} for g in config.robot.joint_groups]
+    groups = [
+        dataclasses.replace(g, armature=None, **new) for g, new in zip(config.robot.joint_groups, changes, strict=True)
+    ]
     robot = dataclasses.replace(config.robot, armature=0.02, joint_groups=groups)
     engine = dataclasses.replace(config.engine, physics_dt=0.004, solver_iterations=7, cone="elliptic")
     model = build_model(robot, engine, config.ball.table)
@@ -162,7 +205,17 @@ def test_ball_is_a_mocap_body_that_touches_nothing(model):
 
 def test_every_contact_body_has_its_sensor_in_order(model):
     names = [model.sensor(i).name for i in range(model.nsensor)]
-    assert names == ["left_foot_force", "right_foot_force", *(f"{body}_touch" for body in CONTACT_BODIES)]
+    touches = [f"{body}_touch" for body in CONTACT_BODIES]
+    assert names == ["left_foot_force", "right_foot_force", *touches, "table_force", "free_hand_force"]
+
+
+def test_a_robot_without_a_free_hand_has_no_sensor_for_it(config):
+    for hand, count in (("left_hand_link", 2), ("", 1)):
+        robot = dataclasses.replace(config.robot, free_hand=hand)
+        model = build_model(robot, config.engine, config.ball.table)
+        assert model.nsensordata == 2 * 3 + len(CONTACT_BODIES) + 3 * count
+    with pytest.raises(ConfigError, match=r"robot\.free_hand: the robot has no body third_hand"):
+        build_model(dataclasses.replace(config.robot, free_hand="third_hand"), config.engine, config.ball.table)
 
 
 def test_wrong_joint_names_are_config_errors(config):
@@ -172,3 +225,10 @@ def test_wrong_joint_names_are_config_errors(config):
     groups = dataclasses.replace(config.robot, joint_groups=config.robot.joint_groups[1:])
     with pytest.raises(ConfigError, match="Left_Hip_Pitch"):
         joint_gains(groups)
+
+
+@pytest.mark.parametrize("key", ["armature", "friction"])
+@pytest.mark.parametrize("value", [-0.1, math.inf, math.nan])
+def test_wrong_armature_and_friction_are_config_errors(config, key, value):
+    with pytest.raises(ConfigError, match=rf"Hip_Pitch.*{key}"):
+        dataclasses.replace(config.robot.joint_groups[0], **{key: value})

@@ -57,10 +57,24 @@ def test_mass_joints_and_limits_are_the_makers(model: mujoco.MjModel) -> None:
         np.testing.assert_allclose(model.actuator(name).forcerange, (-effort, effort))
 
 
+def test_its_motors_are_those_of_the_t1(model: mujoco.MjModel) -> None:
+    """Joints of the same name have the same armature and friction; wrist yaw has the motor of the arm."""
+    config = load_train_config(["robot=t1"])
+    other = build_model(config.robot, config.engine, config.ball.table)
+    for name in SPEC.joints:
+        own, like = model.joint(name), name.replace("Wrist_Yaw", "Elbow_Yaw")
+        if "Wrist_Pitch" in name or "Hand_Roll" in name:
+            assert (own.armature[0], own.frictionloss[0]) == (0.001, 0.2)
+        else:
+            known = other.joint(like)
+            assert (own.armature[0], own.frictionloss[0]) == (known.armature[0], known.frictionloss[0])
+
+
 def test_the_arm_reaches_from_the_trunk_to_the_paddle() -> None:
     parts = "Shoulder_Pitch", "Shoulder_Roll", "Elbow_Pitch", "Elbow_Yaw", "Wrist_Pitch", "Wrist_Yaw", "Hand_Roll"
     assert SPEC.arm == SPEC.groups["right_arm"] == tuple(f"Right_{part}" for part in parts)
-    assert SPEC.contacts == RobotSpec.of(load_train_config().robot).contacts
+    contacts = RobotSpec.of(load_train_config().robot).contacts
+    assert tuple(name for name in SPEC.contacts if name not in ("left_hand", "right_hand")) == contacts
 
 
 def test_nominal_paddle_is_where_the_t1_holds_its_own(model: mujoco.MjModel) -> None:

@@ -93,8 +93,20 @@ def test_the_paddle_is_tilted_and_shifted_in_a_direction_of_each_world() -> None
     assert (normal - straight.robot.paddle_normal).mean(0).norm() / 0.05 < 3.0 / count**0.5
 
 
+@pytest.mark.parametrize(
+    ("name", "low"),
+    [("speed_scale", 0.0), ("ankle_effort_scale", 0.0), ("joint_friction", -0.1), ("joint_damping", -1.0)],
+)
+def test_ranges_that_no_motor_or_joint_has_are_refused(name: str, low: float) -> None:
+    with pytest.raises(ConfigError, match=rf"randomization\.{name}"):
+        load_train_config([f"randomization.{name}=[{low},1.0]"])
+
+
 def test_randomised_parameters_stay_in_range_and_change_only_masked_worlds() -> None:
-    config = load_train_config(["randomization=moderate", "engine=native"])
+    ranges = {"speed_scale": (0.4, 1.8), "ankle_effort_scale": (0.7, 1.0), "joint_friction": (0.1, 0.5)}
+    ranges["joint_damping"] = (0.0, 0.3)
+    given = [f"randomization.{name}=[{low},{high}]" for name, (low, high) in ranges.items()]
+    config = load_train_config(["randomization=moderate", "engine=native", *given])
     worlds = Worlds(config, 64, "cpu")
     before = {name: value.clone() for name, value in worlds.randomizer.state_dict().items()}
     mask = torch.arange(64) % 2 == 0
@@ -104,6 +116,9 @@ def test_randomised_parameters_stay_in_range_and_change_only_masked_worlds() -> 
     after = worlds.randomizer.state_dict()
     assert after["ball.paddle_restitution"].min() >= low - 1e-6
     assert after["ball.paddle_restitution"].max() <= min(high, 1.0) + 1e-6
+    for name, (least, most) in ranges.items():
+        values = after[f"engine.{name}"]
+        assert least <= values.min() < values.max() <= most
     for name, value in after.items():
         assert torch.equal(value[~mask], before[name][~mask]), name
         low, high = value.min(), value.max()

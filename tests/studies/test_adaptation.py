@@ -8,7 +8,7 @@ import matplotlib.pyplot as plt
 import pytest
 import torch
 
-from pace.evaluation.serves import wilson
+from pace.evaluation.records import wilson
 from pace.studies import adaptation
 from pace.studies.adaptation import SERVES, Adaptation, Forgetful
 from pace.task.observations import POLICY, layout, width

@@ -53,6 +53,20 @@ def test_a_recipe_is_whole_and_of_this_version(name: str) -> None:
         "device", "processes", "seed", "out", "resume", "init_from", "predictor_from", "checkpoint_minutes",
         "tensorboard", "progress", "plugins",
     }  # fmt: skip
+    assert set(plain["ball"]) - set(written(name)["ball"]) == {"air"}  # of which these balls use nothing
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_recipe_has_the_ball_that_it_was_trained_with(name: str) -> None:
+    """The first reading of rubber: no springing back, constant coefficients of the air, sliding friction 0.25."""
+    ball = recipe(name).ball
+    assert (ball.name, ball.drag_coefficient, ball.table_drag, ball.table_lift) == (
+        "rubber_first_reading",
+        0.5,
+        0.0,
+        0.0,
+    )
+    assert (ball.paddle_friction, ball.paddle_tangential_restitution, ball.paddle_drilling_loss) == (0.25, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("name", ["steps_12", "campaign_wide", "no_hit_guidance"])
@@ -145,5 +159,5 @@ def test_the_command_prints_the_tables_of_the_pages(
     assert studies() == 0
     printed = set(capsys.readouterr().out.splitlines())
     page = (RESULTS / "recipe.md").read_text().splitlines()
-    assert {line for line in page if line.startswith(("| steps_12 |", "| generalist |"))} <= printed
+    assert {line for line in page if line.startswith(("| steps_12 |", "| campaign |"))} <= printed
     assert {file.name for file in tmp_path.iterdir()} == {"recipe.png", "learning.png"}

@@ -9,9 +9,8 @@ import pytest
 import torch
 
 from pace.rl.policies import load_policy
-from pace.studies import motors, parity, posture, reaction, steps
+from pace.studies import motors, parity, reaction, steps
 from pace.studies.__main__ import main
-from pace.studies.common import ENDLESS
 from pace.studies.swings import Swings, policy_swings, random_swings
 from tests.helpers.saved import save_run
 
@@ -96,7 +95,7 @@ def test_errors_fall_with_the_step_and_are_those_of_the_step_on_both_engines(mon
 
 def test_the_default_solver_limits_converge() -> None:
     cases = {case.name: case.deviation for case in steps.solver_cases(random_swings(2, 15).windows(15), ("native",))}
-    assert cases["native, 10 and 10 iterations"].paddle.max() < 1e-6
+    assert cases["native, 10 and 15 iterations"].paddle.max() < 1e-6
     assert cases["native, 2 and 4 iterations"].paddle.max() > 1e-4
 
 
@@ -130,36 +129,12 @@ def test_with_the_limit_no_motor_drives_over_its_line(tmp_path: Path) -> None:
         assert (use.fast[use.fastest > 1.0] > 0).all()
         assert (use.over <= use.held).all()
         assert (use.excess[use.over > 0] > 0).all()
-    assert [use.case for use in found] == [motors.WITHOUT, motors.WITH]
-    assert (found[1].over == 0).all()
-    assert found[1].excess.max() < 0.01
+        assert ((use.ended >= 0) & (use.ended <= 1)).all()
+        if use.case != motors.WITHOUT:
+            assert (use.over == 0).all()
+            assert use.excess.max() < 0.01
+    assert [use.case for use in found] == [motors.PAPER, motors.WITHOUT, motors.WITH]
     assert motors.table(found).count("\n") == 2 + len(motors.GROUPS)
-
-
-def test_posture_counts_the_time_of_each_phase_and_touches(tmp_path: Path) -> None:
-    one = posture.posture(load_policy(save_run(tmp_path)), "tiny", 4, 8)
-    assert float(one.phases.sum()) == pytest.approx(1.0)
-    assert (one.phases > 0.1).all()
-    assert one.means.shape == (2, len(posture.MEASURES))
-    assert (one.means[:, 0] <= 100.0).all()
-    assert (one.means[:, 4] > 1.0).all()  # such a policy falls over
-    assert bool((one.touches >= 0).all() & (one.touches <= 1).all())
-    rows = posture.table([one]).splitlines()[2:]
-    assert len(rows) == 2 + len(posture.MEASURES)
-
-
-def test_a_hop_and_a_lift_are_counted_as_such(tmp_path: Path) -> None:
-    env = load_policy(save_run(tmp_path)).make_env(2, "cpu", 1, ENDLESS)
-    recorder = posture.PostureRecorder(env, 0, 4)
-    contact, something = env.task_state.foot_contact, env.task_state.something_to_hit
-    something.copy_(torch.tensor([True, False]))
-    for down in ([[1, 1], [1, 1]], [[0, 0], [1, 1]], [[1, 1], [0, 1]], [[1, 1], [0, 1]]):
-        contact.copy_(torch.tensor(down, dtype=torch.bool))
-        recorder.observe()
-    hops, lifts = recorder.sums[:, 0], recorder.sums[:, 1] * env.worlds.control_dt
-    assert hops.tolist() == [1.0, 0.0]
-    assert lifts.tolist() == pytest.approx([2.0, 1.0])
-    assert recorder.instants.tolist() == [4.0, 4.0]
 
 
 def test_the_commands_print_tables_and_write_figures(

@@ -148,7 +148,7 @@ def test_an_episode_may_begin_in_the_middle_of_a_serve() -> None:
 def test_a_fall_terminates_and_the_serve_counts_as_a_fall() -> None:
     env = make()
     qpos = env.worlds.engine.qpos_path[:, -1].clone()
-    qpos[2, 2] = 0.4
+    qpos[2, 2], qpos[2, 3:7] = 0.2, torch.tensor([0.7071068, 0.0, -0.7071068, 0.0])  # on its back, above the floor
     env.worlds.reset_robot(torch.arange(N) == 2, qpos, torch.zeros(N, 27))
     env.pop_statistics()
     env.advance(torch.zeros(N, 21))

@@ -11,7 +11,7 @@ import torch
 from pace.config.base import ConfigError
 from pace.config.task import ServeConfig
 from pace.sim.ball.ball import BallParams, BallSim
-from pace.task.game import Outcome
+from pace.task.game import Game, Outcome
 from pace.task.resets import PoseSampler, ServeSampler, world_spin
 from pace.task.state import TaskState
 from tests.helpers.fakes import CPU, config, fake_ball, fake_game, set_events
@@ -27,6 +27,7 @@ class Serve:
 
     def __init__(self, playable: bool = True, *overrides: str) -> None:
         self.game, worlds = fake_game(1, config(*(overrides or ("serve=mixed",))))
+        self.table_force = worlds.engine.table_force
         self.ball, self.robot = worlds.ball, worlds.robot
         self.referee, self.ends, self.closeness = self.game.referee, self.game.ends, self.game.closeness
         if not playable:
@@ -155,6 +156,112 @@ def test_rim_hits_are_marked() -> None:
     serve.ball.events.hit_rim.fill_(True)
     serve.game.judge()
     assert bool(serve.referee.rim)
+
+
+BODY: dict[str, Any] = {"body": 0.01}
+
+
+@pytest.mark.parametrize(
+    ("steps", "outcome", "hit"),
+    [
+        pytest.param([BODY], Outcome.BODY, False, id="before the bounce: obstruction"),
+        pytest.param([BOUNCE, BODY], Outcome.BODY, False, id="before the hit"),
+        pytest.param([BOUNCE, BODY, HIT, {"opponent_bounce": 0.01}], Outcome.BODY, False, id="then returned"),
+        pytest.param([BOUNCE, HIT, BODY], Outcome.BODY, True, id="after the hit"),
+        pytest.param([BOUNCE, {"body": 0.004, "paddle_hit": 0.006}], Outcome.BODY, False, id="in the step of the hit"),
+        pytest.param([BOUNCE, {"paddle_hit": 0.004, "body": 0.006}], Outcome.BODY, True, id="right after the hit"),
+        pytest.param([{"own_bounce": 0.006, "body": 0.004}], Outcome.BODY, False, id="just before the bounce"),
+        pytest.param(
+            [BOUNCE, HIT, {"opponent_bounce": 0.01}, BODY], Outcome.SUCCESS, True, id="after the landing: decided"
+        ),
+        pytest.param(
+            [BOUNCE, HIT, {"opponent_bounce": 0.004, "body": 0.01}], Outcome.SUCCESS, True, id="landed just before"
+        ),
+        pytest.param([BOUNCE, HIT, {"opponent_bounce": 0.01, "body": 0.004}], Outcome.BODY, True, id="just after"),
+        pytest.param([BOUNCE, HIT, {"net": 0.002, "body": 0.004}], Outcome.BODY, True, id="off the net onto the body"),
+        pytest.param([BOUNCE, {"floor": 0.004, "body": 0.01}], Outcome.MISS, False, id="floor before body"),
+        pytest.param([BOUNCE, {"floor": 0.01, "body": 0.004}], Outcome.BODY, False, id="body before floor"),
+        pytest.param(
+            [BOUNCE, {"own_bounce": 0.004, "body": 0.01}], Outcome.MISS, False, id="second bounce before body"
+        ),
+        pytest.param(
+            [BOUNCE, {"own_bounce": 0.01, "body": 0.004}], Outcome.BODY, False, id="body before second bounce"
+        ),
+        pytest.param([HIT, BODY], Outcome.VOLLEY, False, id="volley before"),
+    ],
+)
+def test_a_touch_by_the_body_loses_the_point(steps: list[dict[str, Any]], outcome: Outcome, hit: bool) -> None:
+    serve = Serve()
+    for step in steps:
+        serve.step(**step)
+    assert serve.outcome == outcome
+    assert serve.hit is hit
+    assert serve.end().outcome == outcome
+
+
+#: N, force on the robot in both physics steps; the table pushes back at 100 N mean over the step.
+TOP, SIDE, NONE = (0.0, 0.0, 5.0), (-60.0, 0.0, 20.0), (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("robot", "hand", "step", "outcome"),
+    [
+        pytest.param((TOP, NONE), (TOP, NONE), {}, Outcome.TABLE_TOUCH, id="free hand on the top"),
+        pytest.param((TOP, TOP), (NONE, NONE), {}, Outcome.OPEN, id="the paddle on the top"),
+        pytest.param((SIDE, SIDE), (SIDE, SIDE), {}, Outcome.OPEN, id="free hand at the table's side"),
+        pytest.param(((0, 0, -9.0), NONE), ((0, 0, -9.0), NONE), {}, Outcome.OPEN, id="free hand under the top"),
+        pytest.param(((-99.0, 0, 0), (-99.0, 0, 0)), (NONE, NONE), {}, Outcome.OPEN, id="a thigh leans on the edge"),
+        pytest.param(
+            ((-101.0, 0, 0), (-101.0, 0, 0)), (NONE, NONE), {}, Outcome.TABLE_TOUCH, id="a thigh pushes the edge"
+        ),
+        pytest.param(((0, 0, 190.0), NONE), (NONE, NONE), {}, Outcome.OPEN, id="a knock of the paddle"),
+        pytest.param(((0, 0, 210.0), NONE), (NONE, NONE), {}, Outcome.TABLE_TOUCH, id="a hard blow of the paddle"),
+        pytest.param(((-150.0, 0, 0), (150.0, 0, 0)), (NONE, NONE), {}, Outcome.OPEN, id="there and back"),
+        pytest.param((NONE, TOP), (NONE, TOP), {"body": 0.011}, Outcome.TABLE_TOUCH, id="hand before body"),
+        pytest.param((NONE, TOP), (NONE, TOP), {"body": 0.009}, Outcome.BODY, id="body before hand"),
+    ],
+)
+@pytest.mark.parametrize("hit", [False, True])
+def test_the_table_must_not_be_touched_nor_pushed(
+    robot: tuple[Any, ...], hand: tuple[Any, ...], step: dict[str, float], outcome: Outcome, hit: bool
+) -> None:
+    serve = Serve().step(**BOUNCE)
+    if hit:
+        serve.step(**HIT)
+    serve.table_force[0, :, 0], serve.table_force[0, :, 1] = torch.tensor(robot), torch.tensor(hand)
+    assert serve.step(**step).outcome == outcome
+    assert serve.hit is hit
+
+
+def test_a_touch_of_the_table_counts_by_its_time_among_the_others() -> None:
+    for times, outcome in (
+        ({"opponent_bounce": 0.009}, Outcome.SUCCESS),
+        ({"opponent_bounce": 0.011}, Outcome.TABLE_TOUCH),
+    ):
+        serve = Serve().step(**BOUNCE).step(**HIT)
+        serve.table_force[0, 1] = torch.tensor(TOP)  # from 0.010 s on
+        assert serve.step(x=1.0, **times).outcome == outcome
+        serve.table_force[0, 0] = torch.tensor(TOP)
+        assert serve.step().outcome == outcome
+
+
+def test_a_robot_without_a_free_hand_can_only_push() -> None:
+    game, worlds = fake_game(2)
+    pushing = torch.zeros(2, 2, 1, 3)
+    pushing[0], pushing[1] = torch.tensor([0.0, 0.0, 30.0]), torch.tensor([0.0, 0.0, 120.0])
+    game = Game(config(), worlds.ball, worlds.robot.base_position, pushing)
+    game.start_serve(torch.ones(2, dtype=torch.bool))
+    game.judge()
+    assert game.referee.outcome.tolist() == [Outcome.OPEN, Outcome.TABLE_TOUCH]
+
+
+def test_what_is_touched_when_the_ball_is_not_in_play_is_no_fault() -> None:
+    serve = Serve(playable=False).step(**BODY)
+    assert serve.outcome == Outcome.BAD_SERVE
+    serve = Serve().step(**BOUNCE).step(**HIT).step(x=1.0, opponent_bounce=0.01)
+    serve.game.pause.waiting.fill_(True)
+    serve.table_force.fill_(200.0)
+    assert serve.step(**BODY).outcome == Outcome.SUCCESS
 
 
 def test_no_contact_is_a_miss_at_the_end_of_the_serve() -> None:

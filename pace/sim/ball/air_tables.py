@@ -6,7 +6,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from pace.config.sim import AirConfig
+from pace.config.ball import AirConfig
 from pace.sim.ball.aero import AirTables
 
 

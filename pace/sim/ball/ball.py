@@ -16,12 +16,13 @@ from torch import Tensor
 
 from pace.arrays.launch import Bound, Launch, MaskedLaunch
 from pace.arrays.tensors import allocate
+from pace.config.ball import AirConfig, BallConfig, TableConfig
 from pace.config.base import ConfigError, config_dir, parse
-from pace.config.sim import AirConfig, BallConfig, TableConfig
 from pace.sim.ball.aero import AirTables
 from pace.sim.ball.air_tables import air_tables, air_tensors
 from pace.sim.ball.kernels import FORECAST_HORIZON, fly_step, forecast_flight, skip_flight
 from pace.sim.ball.rebound import Material
+from pace.sim.ball.robot_body import RobotBody
 from pace.sim.ball.scene import Scene
 from pace.sim.ball.state import BallEvents, BallState, Forecast
 
@@ -138,7 +139,7 @@ def _material(restitution: float, friction: float) -> Material:
 
 
 def _scene(table: TableConfig, path_dt: float, air: AirTables) -> Scene:
-    """Table, net, floor and air in the kernels' form, without the paddle's path."""
+    """Table, net, floor, materials and air in the kernels' form, without the paths of paddle and body."""
     scene = Scene()
     scene.air = air
     scene.table_centre = wp.vec3(0.0, 0.0, table.height - 0.5 * table.thickness)
@@ -147,10 +148,18 @@ def _scene(table: TableConfig, path_dt: float, air: AirTables) -> Scene:
     scene.net_half = wp.vec3(0.5 * NET_THICKNESS, 0.5 * table.width + table.net_overhang, 0.5 * table.net_height)
     scene.net = _material(table.net_restitution, table.net_friction)
     scene.floor = _material(table.floor_restitution, table.floor_friction)
+    scene.skin = _material(table.body_restitution, table.body_friction)
     scene.paddle_radius = table.paddle_radius
     scene.paddle_half_thickness = table.paddle_half_thickness
     scene.path_dt = path_dt
     return scene
+
+
+def _nobody(num_worlds: int, device: torch.device) -> RobotBody:
+    """A body without shapes."""
+    body = RobotBody()
+    body.near_count = wp.zeros(num_worlds, dtype=wp.int32, device=wp.device_from_torch(device))
+    return body
 
 
 class BallSim(BallState):
@@ -177,6 +186,8 @@ class BallSim(BallState):
         ball_dt: s, longest sub-step of a flight.
         air: measured coefficients, of which ``params.table_drag`` and ``params.table_lift`` are shares; ``None``:
             those of the default preset.
+        robot: the robot's body, posed before each flight by its owner (:mod:`pace.sim.bodies`); ``None``: there is only
+            the paddle.
     """
 
     def __init__(
@@ -189,6 +200,7 @@ class BallSim(BallState):
         substeps: int,
         ball_dt: float,
         air: AirConfig | None = None,
+        robot: RobotBody | None = None,
     ) -> None:
         if num_worlds < 1:
             raise ValueError(f"num_worlds must be at least 1, got {num_worlds}")
@@ -205,6 +217,7 @@ class BallSim(BallState):
         self._path_shape = (num_worlds, substeps + 1, PATH_WIDTH)
         self._air = air_tensors(air or _measured_air(), device)
         self._scene = _scene(table, control_dt / substeps, air_tables(self._air))
+        self._robot = self._scene.robot = robot or _nobody(num_worlds, self.device)
         self._flown = {"params": matrix, "scene": self._scene, "ball_dt": ball_dt}  # arguments of every flight
         self._ask = allocate(BallState, num_worlds, device)
         self._ahead: dict[float, MaskedLaunch] = {}  # by intercept_x, from _ask
@@ -226,7 +239,8 @@ class BallSim(BallState):
 
         Between the instants centre and normal follow cubics through their values (the velocities are used only if
         S = 1), and the angular velocity is interpolated linearly.
-        Give the same tensor each time: another one is bound again, which takes longer.
+        Give the same tensor each time: another one is bound again, which takes longer. The impulses of ball on body
+        do not act back on the robot; those on the paddle are in ``events``.
 
         Errors: ``ValueError`` for another shape, type or memory layout.
         """
@@ -236,7 +250,7 @@ class BallSim(BallState):
         """Simulate ahead from position, velocity and spin (N, 3) in the worlds of ``mask`` (N,) bool.
 
         Fills their rows of ``forecast_result`` and leaves the others; ``intercept_x`` is in m. The flight collides with
-        net, table and floor, but not with paddles.
+        net, table and floor, but not with a robot.
         """
         for own, given in zip(vars(self._ask).values(), (position, velocity, spin), strict=True):
             own.copy_(given)

@@ -4,7 +4,7 @@ import warp as wp
 
 from pace.sim.ball.arc import Arc, arc_position, arc_velocity
 from pace.sim.ball.gaps import gap_to, surface_velocity
-from pace.sim.ball.scene import ALL_SURFACES, FLOOR, NET, NOTHING, PADDLE, TABLE, Scene
+from pace.sim.ball.scene import ALL_SURFACES, BODY, FLOOR, NET, NOTHING, PADDLE, TABLE, Gaps, Scene
 
 #: m, a smaller gap counts as touching.
 TOUCH = 1.0e-5
@@ -121,26 +121,27 @@ def may_touch(gap: float, end_gap: float, speed: float, duration: float) -> bool
 @wp.func
 def first_contact(
     arc: Arc,
-    gaps: wp.vec4,
-    end_gaps: wp.vec4,
+    gaps: Gaps,
+    end_gaps: Gaps,
     speed: float,
-    paddle_speed: float,
+    robot_speed: float,
     radius: float,
     scene: Scene,
     world: int,
 ) -> Contact:
-    """The earliest contact on an arc; ``speed`` bounds the ball's, ``paddle_speed`` the paddle's (m/s)."""
+    """The earliest contact on an arc; ``speed`` bounds the ball's, ``robot_speed`` that of paddle and body (m/s)."""
     first = Contact()
     first.surface = NOTHING
     first.time = 2.0 * arc.duration
     sums = gaps + end_gaps
     still = wp.min(sums[TABLE], wp.min(sums[NET], sums[FLOOR]))
-    if still >= speed * arc.duration and sums[PADDLE] >= (speed + paddle_speed) * arc.duration:
+    moving = wp.min(sums[PADDLE], sums[BODY])
+    if still >= speed * arc.duration and moving >= (speed + robot_speed) * arc.duration:
         return first  # all surfaces stay too far away
     for surface in range(ALL_SURFACES):
         relative = wp.float32(speed)
-        if surface == PADDLE:
-            relative += paddle_speed
+        if surface >= PADDLE:
+            relative += robot_speed
         gap = gaps[surface]
         end_gap = end_gaps[surface]
         if may_touch(gap, end_gap, relative, arc.duration):

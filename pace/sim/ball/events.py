@@ -4,7 +4,8 @@ import warp as wp
 
 from pace.sim.ball.flight import Flight, Leg
 from pace.sim.ball.paddle import paddle_pose
-from pace.sim.ball.scene import NET, PADDLE, TABLE, Body, Scene
+from pace.sim.ball.robot_body import nearest_shape
+from pace.sim.ball.scene import BODY, NET, PADDLE, TABLE, Body, Scene
 from pace.sim.ball.state import EventArrays
 
 
@@ -17,12 +18,14 @@ def clear_events(events: EventArrays, world: int):
     events.net[world] = 0
     events.floor[world] = 0
     events.edge[world] = 0
+    events.body[world] = 0
     events.own_bounce_time[world] = wp.inf
     events.opponent_bounce_time[world] = wp.inf
     events.paddle_hit_time[world] = wp.inf
     events.net_time[world] = wp.inf
     events.floor_time[world] = wp.inf
     events.edge_time[world] = wp.inf
+    events.body_time[world] = wp.inf
     events.hit_point[world] = zero
     events.hit_position[world] = zero
     events.hit_offset[world] = zero
@@ -81,10 +84,24 @@ def _record_hit(events: EventArrays, leg: Leg, after: Flight, point: wp.vec3, sc
 
 
 @wp.func
+def by_paddle_hand(leg: Leg, clock: float, scene: Scene, world: int) -> bool:
+    """Whether the contact is with the hand that holds the paddle."""
+    if leg.surface != BODY:
+        return False
+    nearest = nearest_shape(scene.robot, world, leg.arc.end, clock, scene.path_dt)
+    if nearest.shape < 0:  # a ball that is not finite
+        return False
+    return scene.robot.hand[nearest.shape]
+
+
+@wp.func
 def record_event(events: EventArrays, leg: Leg, after: Flight, body: Body, scene: Scene, world: int):
-    """Enter the contact at the end of ``leg`` into the events; ``after`` is the flight behind the impulse."""
+    """Enter the contact at the end of ``leg`` into the events; ``after`` is the flight behind the impulse.
+
+    The hand that holds the paddle hits as the paddle does.
+    """
     clock = after.clock
-    if leg.surface == PADDLE:
+    if leg.surface == PADDLE or by_paddle_hand(leg, clock, scene, world):
         point = leg.arc.end - body.radius * leg.normal
         change = after.velocity - leg.arc.end_velocity
         events.paddle_impulse[world] = events.paddle_impulse[world] - body.mass * change
@@ -98,5 +115,7 @@ def record_event(events: EventArrays, leg: Leg, after: Flight, body: Body, scene
             _record_table(events, leg, clock, world)
         elif leg.surface == NET:
             _count(events.net, events.net_time, world, clock)
+        elif leg.surface == BODY:
+            _count(events.body, events.body_time, world, clock)
         else:
             _count(events.floor, events.floor_time, world, clock)

@@ -1,4 +1,4 @@
-"""One sub-step of a ball among table, net, floor and a moving paddle, as Warp functions.
+"""One sub-step of a ball among table, net, floor, a moving paddle and a moving body, as Warp functions.
 
 The ball flies an arc; every surface whose gap closes within it is located by bisection on the arc's cubic Hermite
 curve, the ball is flown again to the first of these contacts, and the impulse acts there. So the result depends neither
@@ -13,7 +13,7 @@ from pace.sim.ball.arc import Arc
 from pace.sim.ball.contact import Contact, first_contact
 from pace.sim.ball.gaps import gap_to, gaps_to, surface_velocity
 from pace.sim.ball.rebound import rebound
-from pace.sim.ball.scene import FLOOR, NET, NOTHING, PADDLE, TABLE, Body, Scene, material_of
+from pace.sim.ball.scene import BODY, FLOOR, NET, NOTHING, PADDLE, TABLE, Body, Gaps, Scene, material_of
 
 #: m, longest way of the ball against a near surface in one sub-step; less than the ball's radius, so none is jumped.
 MAX_TRAVEL = 0.015
@@ -31,7 +31,7 @@ class Flight:
     velocity: wp.vec3
     spin: wp.vec3
     clock: wp.float32
-    gaps: wp.vec4
+    gaps: Gaps
     located: wp.int32
 
 
@@ -47,11 +47,11 @@ class Leg:
 
 
 @wp.func
-def substep_length(gaps: wp.vec4, speed: float, paddle_speed: float, remaining: float, longest: float) -> float:
+def substep_length(gaps: Gaps, speed: float, robot_speed: float, remaining: float, longest: float) -> float:
     """Length (s) of the next sub-step: at most ``longest``, and no further than the nearest surface or MAX_TRAVEL."""
     still = wp.min(gaps[TABLE], wp.min(gaps[NET], gaps[FLOOR]))
     step = wp.min(longest, wp.max(still, MAX_TRAVEL) / speed)
-    step = wp.min(step, wp.max(gaps[PADDLE], MAX_TRAVEL) / (speed + paddle_speed))
+    step = wp.min(step, wp.max(wp.min(gaps[PADDLE], gaps[BODY]), MAX_TRAVEL) / (speed + robot_speed))
     return remaining / wp.ceil(remaining / wp.max(step, MIN_SUBSTEP))
 
 
@@ -102,7 +102,7 @@ def free_arc(flight: Flight, body: Body, scene: Scene, duration: float) -> Arc:
 def fly_leg(
     flight: Flight,
     surfaces: int,
-    paddle_speed: float,
+    robot_speed: float,
     remaining: float,
     longest: float,
     body: Body,
@@ -114,9 +114,9 @@ def fly_leg(
     Returns the flight after it, impulse included, and the leg that was flown.
     """
     speed = wp.length(flight.velocity) + GRAVITY * longest
-    arc = free_arc(flight, body, scene, substep_length(flight.gaps, speed, paddle_speed, remaining, longest))
+    arc = free_arc(flight, body, scene, substep_length(flight.gaps, speed, robot_speed, remaining, longest))
     end_gaps = gaps_to(surfaces, arc.end, arc.clock + arc.duration, body.radius, scene, world)
-    contact = first_contact(arc, flight.gaps, end_gaps, speed, paddle_speed, body.radius, scene, world)
+    contact = first_contact(arc, flight.gaps, end_gaps, speed, robot_speed, body.radius, scene, world)
     leg = Leg()
     leg.surface = contact.surface
     if contact.surface != NOTHING:

@@ -10,7 +10,7 @@ from pace.sim.ball.flight import Flight, fly_leg
 from pace.sim.ball.forecast_notes import clear_forecast, note_apex, note_contact, note_net
 from pace.sim.ball.gaps import gaps_to, reachable_surfaces
 from pace.sim.ball.paddle import paddle_centre, paddle_speed_bound
-from pace.sim.ball.scene import FLOOR, NOTHING, STATIC_SURFACES, Scene, read_body
+from pace.sim.ball.scene import BODY, FLOOR, NOTHING, STATIC_SURFACES, Scene, read_body
 from pace.sim.ball.state import BallArrays, EventArrays, ForecastArrays
 
 #: s; the forecast ends there, because a ball may roll on the table without end.
@@ -49,21 +49,24 @@ def fly_step(
     control_dt: float,
     ball_dt: float,
 ):
-    """Fly the ball of each world through one control step along the paddle's path."""
+    """Fly the ball of each world through one control step along the paths of paddle and body."""
     world = wp.tid()
     clear_events(events, world)
     body = read_body(params, world)
     flight = _flight_of(ball, world)
     paddle_speed = paddle_speed_bound(scene, world)
+    robot_speed = wp.float32(paddle_speed)
     # A rebound turns spin into speed.
     speed = wp.length(flight.velocity) + body.radius * wp.length(flight.spin)
     surfaces = reachable_surfaces(flight.position, speed, paddle_speed, control_dt, body.radius, scene, world)
+    if surfaces > BODY:
+        robot_speed = wp.max(paddle_speed, scene.robot.speed[world])
     flight.gaps = gaps_to(surfaces, flight.position, 0.0, body.radius, scene, world)
     centre = paddle_centre(scene, world, 0.0)
     distance = wp.length(flight.position - centre)
     for _leg in range(_MAX_LEGS):
         remaining = control_dt - flight.clock
-        flight, leg = fly_leg(flight, surfaces, paddle_speed, remaining, ball_dt, body, scene, world)
+        flight, leg = fly_leg(flight, surfaces, robot_speed, remaining, ball_dt, body, scene, world)
         next_centre = paddle_centre(scene, world, flight.clock)
         distance = wp.min(distance, _segment_distance(leg.arc.start - centre, leg.arc.end - next_centre))
         centre = next_centre
@@ -87,7 +90,7 @@ def forecast_flight(
     intercept_x: float,
     ball_dt: float,
 ):
-    """Fly the ball of each masked world ahead, without a paddle, and note what it meets. The others keep theirs."""
+    """Fly the ball of each masked world ahead, without a robot, and note what it meets. The others keep theirs."""
     world = wp.tid()
     if not mask[world]:
         return
@@ -118,7 +121,7 @@ def skip_flight(
     scene: Scene,
     ball_dt: float,
 ):
-    """Move the ball of each masked world on by ``duration`` s without a paddle, or to the last sub-step in the air."""
+    """Move the ball of each masked world on by ``duration`` s without a robot, or to the last sub-step in the air."""
     world = wp.tid()
     if not mask[world]:
         return

@@ -4,15 +4,21 @@ import warp as wp
 
 from pace.sim.ball.aero import Air, AirTables, air_factors
 from pace.sim.ball.rebound import Material
+from pace.sim.ball.robot_body import RobotBody
 
 NOTHING = wp.constant(-1)
 TABLE = wp.constant(0)
 NET = wp.constant(1)
 FLOOR = wp.constant(2)
 PADDLE = wp.constant(3)
+BODY = wp.constant(4)
 #: Surfaces below this number stand still; the forecast meets only these.
 STATIC_SURFACES = 3
-ALL_SURFACES = 4
+ALL_SURFACES = 5
+
+
+class Gaps(wp.types.vector(length=ALL_SURFACES, dtype=wp.float32)):
+    """A gap (m) to each surface."""
 
 
 @wp.struct
@@ -28,7 +34,7 @@ class Body:
 
 @wp.struct
 class Scene:
-    """What the ball can meet, and the knots of the paddle's path of one control step."""
+    """What the ball can meet, the knots of the paddle's path and the robot's shapes in one control step."""
 
     table_centre: wp.vec3
     table_half: wp.vec3
@@ -36,10 +42,12 @@ class Scene:
     net_half: wp.vec3
     net: Material
     floor: Material
+    skin: Material  # of the robot's body
     paddle_radius: wp.float32
     paddle_half_thickness: wp.float32
     path: wp.array3d[wp.float32]  # (N, S + 1, 12): centre, unit normal, linear and angular velocity
     path_dt: wp.float32  # s between knots
+    robot: RobotBody
     air: AirTables
 
 
@@ -75,4 +83,6 @@ def material_of(surface: int, body: Body, scene: Scene) -> Material:
         return scene.net
     if surface == FLOOR:
         return scene.floor
+    if surface == BODY:
+        return scene.skin
     return body.paddle

@@ -26,8 +26,10 @@ class BallEvents:
     """Contacts of the ball in the last control step; every flight overwrites all of them.
 
     Counts are of contacts that begin; a rolling or resting ball counts once. The rims of the table's top belong to the
-    top (ITTF 2.1.5); its sides and underside count as ``edge``. Times are s into the control step, of the first contact
-    of that kind, infinite if there is none. The ``hit`` values belong to the first paddle hit and are zero without one.
+    top (ITTF 2.1.5); its sides and underside count as ``edge``. ``body`` is the robot's body, arms, legs and head; the
+    hand that holds the paddle, below the wrist, counts as the paddle (ITTF 2.5.7). Times are s into the control step,
+    of the first contact of that kind, infinite if there is none. The ``hit`` values belong to the first paddle hit and
+    are zero without one.
     """
 
     own_bounce: Int
@@ -36,12 +38,14 @@ class BallEvents:
     net: Int
     floor: Int
     edge: Int
+    body: Int
     own_bounce_time: InfFloat  # s
     opponent_bounce_time: InfFloat  # s
     paddle_hit_time: InfFloat  # s
     net_time: InfFloat  # s
     floor_time: InfFloat  # s
     edge_time: InfFloat  # s
+    body_time: InfFloat  # s
     hit_point: Vec3  # m, contact point of ball and paddle
     hit_position: Vec3  # m, ball's centre
     hit_offset: Vec3  # m, ball's centre minus paddle's centre
@@ -50,7 +54,7 @@ class BallEvents:
     hit_velocity_in: Vec3  # m/s
     hit_velocity_out: Vec3  # m/s
     hit_spin_out: Vec3  # rad/s
-    hit_rim: Bool  # the rim or its edge rather than a face
+    hit_rim: Bool  # the rim or its edge rather than a face; also the hand that holds the paddle
     paddle_impulse: Vec3  # N s on the paddle, sum over the step
     impulse_point: Vec3  # m, contact point of the last impulse
     bounce_position: Vec3  # m, ball's centre at the step's first bounce on the table's top
@@ -63,7 +67,7 @@ class EventArrays:
 
 @dataclass(frozen=True)
 class Forecast:
-    """A flight ahead without a paddle: tensors (N, ...), float32, s and m from now on, NaN if an event does not occur.
+    """A flight ahead without a robot: tensors (N, ...), float32, s and m from now on, NaN if an event does not occur.
 
     ``bounce`` is the first on the own half, ``apex`` the first highest point after it, and ``intercept`` the later of
     the apex and the passing of x = intercept_x. ``landing`` is the first contact with the table's top or the floor.

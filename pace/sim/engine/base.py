@@ -15,7 +15,7 @@ from pace.arrays.launch import Bound, MaskedLaunch
 from pace.arrays.state import Stateful
 from pace.arrays.tensors import Float, Start, Vec3, allocate, named_tensors, struct_of
 from pace.config.base import ConfigError
-from pace.sim.robot_spec import FEET
+from pace.sim.robot_spec import FEET, TABLE_FORCES
 
 Unit = Annotated[Float, Start(1.0)]
 
@@ -34,6 +34,10 @@ class EngineParams:
     kd_scale: Unit
     armature_scale: Unit
     effort_scale: Unit  # of the effort and, if the motors have a torque-speed line, of the stall torque
+    speed_scale: Unit  # of the no-load speed of that line, at the same stall torque
+    ankle_effort_scale: Unit  # times effort_scale, of the joints of the robot's group ``ankles``
+    joint_friction: Float  # N m added to the dry friction of all joints
+    joint_damping: Float  # N m s/rad, viscous friction added to all joints
 
     @classmethod
     def nominal(cls, model: mujoco.MjModel, num_worlds: int, device: torch.device) -> EngineParams:
@@ -53,6 +57,8 @@ class RobotEngine(Protocol):
         foot_force: (N, 2, 3) N, world frame: net contact force on the left and right foot in the last physics step.
         body_contact: (N, B): 1 if that body of ``RobotSpec.contacts`` touched anything in the last physics step.
         joint_torque: (N, J) N m: of the motors in the last physics step.
+        table_force: (N, S, T, 3) N, world frame: net contact force of the table on the robot in each of the S physics
+            steps; on the whole robot and, if ``robot.free_hand`` names one (T = 2), on its free hand.
         params: physical parameters of each world.
     """
 
@@ -66,6 +72,7 @@ class RobotEngine(Protocol):
     foot_force: Tensor
     body_contact: Tensor
     joint_torque: Tensor
+    table_force: Tensor
 
     def advance(self, targets: Tensor, applied: Tensor) -> None:
         """Simulate one control step.
@@ -135,9 +142,13 @@ class StateTensors(EngineState, Stateful):
             raise ConfigError(f"substeps must be at least 1, got {substeps}")
         self.num_worlds, self.device, self.substeps, self.physics_dt = num_worlds, device, substeps, physics_dt
         self.params = EngineParams.nominal(model, num_worlds, device)
-        sizes = {"feet": FEET, "bodies": model.nsensordata - 3 * FEET, "joints": model.nu}
+        touches = sum(model.sensor(i).name in TABLE_FORCES for i in range(model.nsensor))
+        sizes = {"feet": FEET, "bodies": model.nsensordata - 3 * (FEET + touches), "joints": model.nu}
         sizes |= {"instants": substeps + 1, "nq": model.nq, "nv": model.nv}
         super().__init__(**vars(allocate(EngineState, num_worlds, device, **sizes)))
+        self.table_force = torch.zeros(
+            num_worlds, substeps, touches, 3, device=device
+        )  # of each step: no part of the state
         self.qpos_path.copy_(torch.as_tensor(model.key_qpos[0], dtype=torch.float32))
         starts = {"qpos": (num_worlds, model.nq), "qvel": (num_worlds, model.nv)}
         self._reset = Bound(self._record_reset, **starts)
@@ -158,10 +169,11 @@ class StateTensors(EngineState, Stateful):
         return self._solver_state() | named_tensors(self)
 
     def _read_sensors(self, sensordata: Tensor, actuator_force: Tensor) -> None:
-        """Sensors of the scene: a force of 3 for each foot, then a number of contacts for each other body."""
+        """Sensors of the scene: a force of 3 for each foot, a number of contacts for each other body, forces on the
+        table, which the engine reads in each physics step."""
         feet = self.foot_force.shape[1] * 3
         self.foot_force.view(self.num_worlds, feet).copy_(sensordata[:, :feet])
-        self.body_contact.copy_(sensordata[:, feet:])
+        self.body_contact.copy_(sensordata[:, feet : feet + self.body_contact.shape[1]])
         self.body_contact.clamp_(max=1.0)
         self.joint_torque.copy_(actuator_force)
 

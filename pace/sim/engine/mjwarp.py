@@ -36,11 +36,19 @@ def _load_targets(targets: wp.array3d[float], step: int, ctrl: wp.array2d[float]
 def _record_state(
     qpos: wp.array2d[float],
     qvel: wp.array2d[float],
+    sensordata: wp.array2d[float],
     instant: int,
     qpos_path: wp.array3d[float],
     qvel_path: wp.array3d[float],
+    table_force: wp.array3d[wp.vec3],
 ):
+    """The state at an instant, and the forces on the table in the physics step that led to it."""
     world = wp.tid()
+    touches = table_force.shape[2]
+    for touch in range(wp.where(instant > 0, touches, 0)):
+        at = sensordata.shape[1] - 3 * (touches - touch)
+        force = wp.vec3(sensordata[world, at], sensordata[world, at + 1], sensordata[world, at + 2])
+        table_force[world, instant - 1, touch] = force
     for i in range(qpos.shape[1]):
         qpos_path[world, instant, i] = qpos[world, i]
     for i in range(qvel.shape[1]):
@@ -105,10 +113,10 @@ class MjwarpEngine(StateTensors):
         return Launch(_load_targets, ctrl.shape, self.device, targets=self._targets, step=step, ctrl=ctrl)
 
     def _record_state(self, instant: int) -> Launch:
-        data, paths = self.data, {"qpos_path": self.qpos_path, "qvel_path": self.qvel_path}
-        return Launch(
-            _record_state, self.num_worlds, self.device, qpos=data.qpos, qvel=data.qvel, instant=instant, **paths
-        )
+        data, table = self.data, self.table_force
+        given = {"qpos": data.qpos, "qvel": data.qvel, "sensordata": data.sensordata}
+        paths = {"qpos_path": self.qpos_path, "qvel_path": self.qvel_path, "table_force": table}
+        return Launch(_record_state, self.num_worlds, self.device, instant=instant, **given, **paths)
 
     def _solver_state(self) -> dict[str, Tensor]:
         return {"qpos": self._qpos, "qvel": self._qvel, "warmstart": self._warmstart}

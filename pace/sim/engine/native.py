@@ -15,11 +15,12 @@ from torch import Tensor
 
 from pace.config.base import ConfigError
 from pace.config.sim import EngineConfig
-from pace.devices import usable_cores
+from pace.cores import usable_cores
 from pace.sim.engine.base import StateTensors
 from pace.sim.engine.model_fields import ModelFields
 
-_CONTROL = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
+#: Inputs of a rollout: targets, then generalized forces.
+CONTROL = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
 
 
 class NativeEngine(StateTensors):
@@ -50,6 +51,8 @@ class NativeEngine(StateTensors):
         self._record = {name: np.zeros((num_worlds, substeps, width)) for name, width in widths.items()}
         self._sensordata = torch.from_numpy(self._record["sensordata"])[:, -1]
         self._actuator_force = torch.from_numpy(self._record["actuator_force"])[:, -1]
+        self._on_table = self._record["sensordata"][..., model.nsensordata - 3 * self.table_force.shape[2] :]
+        self._table_force = self.table_force.numpy().reshape(self._on_table.shape)
         # NumPy copies: torch's would wake torch's threads beside the pool's, which costs milliseconds on busy cores
         self._paths = {"qpos": self.qpos_path.numpy(), "qvel": self.qvel_path.numpy()}
         self._qpos[:] = self._paths["qpos"][:, 0]
@@ -59,10 +62,15 @@ class NativeEngine(StateTensors):
         self._applied[:] = applied.numpy()[:, None]
         self._paths["qpos"][:, 0] = self._qpos
         self._paths["qvel"][:, 0] = self._qvel
-        self._batch.rollout(self.substeps, self._control, _CONTROL, tuple(self._record), out=self._record)
+        self._roll_out()
         for name, path in self._paths.items():
             path[:, 1:] = self._record[name]
+        self._table_force[:] = self._on_table
         self._read_sensors(self._sensordata, self._actuator_force)
+
+    def _roll_out(self) -> None:
+        """Simulate the physics steps of one control step, and record them."""
+        self._batch.rollout(self.substeps, self._control, CONTROL, tuple(self._record), out=self._record)
 
     def _solver_state(self) -> dict[str, Tensor]:
         state = {"qpos": self._qpos, "qvel": self._qvel, "warmstart": self._warmstart}

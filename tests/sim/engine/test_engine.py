@@ -219,6 +219,25 @@ def _effort(model):
     model.actuator_gainprm[:, 0] /= 0.2  # the resistance: the stall torque too
 
 
+def _speed(model):
+    model.actuator_gainprm[:, 7] *= 0.1  # the largest voltage, with a constant of 1 the no-load speed
+    model.actuator_gainprm[:, 0] *= 0.1  # the resistance: the same stall torque
+
+
+def _ankles(model):
+    ankles = [index for index, name in enumerate(JOINT_NAMES) if "Ankle" in name]
+    model.actuator_forcerange[ankles] *= 0.1
+    model.actuator_gainprm[ankles, 0] /= 0.1
+
+
+def _joint_friction(model):
+    model.dof_frictionloss[6:] += 1.5
+
+
+def _joint_damping(model):
+    model.dof_damping[6:] += 2.0
+
+
 CHANGES = {
     "friction": (0.3, _friction),
     "trunk_mass": (3.0, _trunk_mass),
@@ -227,6 +246,10 @@ CHANGES = {
     "kd_scale": (0.6, _kd),
     "armature_scale": (2.5, _armature),
     "effort_scale": (0.2, _effort),
+    "speed_scale": (0.1, _speed),
+    "ankle_effort_scale": (0.1, _ankles),
+    "joint_friction": (1.5, _joint_friction),
+    "joint_damping": (2.0, _joint_damping),
 }
 
 
@@ -257,13 +280,34 @@ def test_a_parameter_changes_its_world_alone_and_as_in_mujoco(fresh, name):
 
     reference = build_model(CONFIG.robot, CONFIG.engine, CONFIG.ball.table)
     by_hand(reference)
-    data = mujoco.MjData(reference)
-    mujoco.mj_resetDataKeyframe(reference, data, 0)
+    np.testing.assert_allclose(changed[1, -1], mujocos(reference, targets, shove), atol=5e-3)
+
+
+def mujocos(model, targets, shove):
+    """Velocities (27,) that MuJoCo computes for the motion of :func:`play`."""
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
     for target in targets:
-        for step in range(engine.substeps):
-            data.ctrl[:], data.qfrc_applied[:] = target[step], shove
-            mujoco.mj_step(reference, data)
-    np.testing.assert_allclose(changed[1, -1], data.qvel, atol=5e-3)
+        for step in target:
+            data.ctrl[:], data.qfrc_applied[:] = step, shove
+            mujoco.mj_step(model, data)
+    return data.qvel
+
+
+@pytest.mark.parametrize("name", ENGINES)
+def test_joints_without_friction_can_have_some(name):
+    """The engines set a row of the solver aside for each joint with friction."""
+    config = load_train_config(["robot=t1_paper", f"engine={name}", "engine.threads=1"])
+    reference = build_model(config.robot, config.engine, config.ball.table)
+    assert not reference.dof_frictionloss.any()
+    engine = make_engine(reference, config.engine, WORLDS, "cpu", 2)
+    engine.params.joint_friction[1] = 1.5
+    engine.apply_params(EVERY)
+    velocities, targets, shove = play(engine, reference)
+    np.testing.assert_allclose(velocities[0, -1], mujocos(reference, targets, shove), atol=5e-3)
+    _joint_friction(reference)
+    np.testing.assert_allclose(velocities[1, -1], mujocos(reference, targets, shove), atol=5e-3)
+    assert (velocities[1] - velocities[0]).abs().max() > 1e-2
 
 
 def test_parameters_can_be_taken_back(fresh):
@@ -331,6 +375,62 @@ def test_paddle_in_the_table_is_seen(fresh):
     engine.advance(hold(engine), STILL)
     assert engine.body_contact[3, CONTACT_BODIES.index("paddle")] == 1.0
     assert not engine.body_contact[:3].any()
+
+
+def beside_the_table(model):
+    """Standing away from it; left forearm, held forwards, 2 mm in its top; thighs 2 mm in its end; paddle in it."""
+    data, at = mujoco.MjData(model), standing(model)
+    at[1, 7 + JOINT_NAMES.index("Left_Shoulder_Pitch")] = -1.57
+    for world, name, place in ((1, "left_forearm", [-1.25, 0.2, 0.758]), (3, "paddle", [-1.3, 0.2, 0.758])):
+        put_lowest(model, data, at[world], name, np.array(place))
+    data.qpos[:] = at[2]
+    mujoco.mj_kinematics(model, data)
+    front = np.array([-1.368 - model.geom("left_thigh").size[0], 0.2, 0.745])
+    at[2, :3] += torch.tensor(front - data.geom("left_thigh").xpos, dtype=torch.float32)
+    return at
+
+
+def put_lowest(model, data, qpos, name, place):
+    """Move a robot so that the lowest point of a capsule, or about that of a cylinder, is at ``place``."""
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(model, data)
+    steep, size = abs(data.geom(name).xmat[8]), model.geom(name).size
+    depth = size[1] * steep + size[0] * (np.sqrt(1 - steep**2) if name == "paddle" else 1.0)
+    lift = np.array([0.0, 0.0, depth])
+    qpos[:3] += torch.tensor(place + lift - data.geom(name).xpos, dtype=torch.float32)
+
+
+def forces_on_the_robot(model, data):
+    """Sums (2, 3) N of MuJoCo's contact forces between table and robot, and table and left forearm."""
+    table, forearm, sums = model.geom("table").id, model.geom("left_forearm").id, np.zeros((2, 3))
+    for index, contact in enumerate(data.contact[: data.ncon]):
+        if table in contact.geom:
+            wrench = np.zeros(6)
+            mujoco.mj_contactForce(model, data, index, wrench)
+            force = contact.frame.reshape(3, 3).T @ wrench[:3] * (1.0 if contact.geom[0] == table else -1.0)
+            sums += np.array([force, force * (forearm in contact.geom)])
+    return sums
+
+
+def test_forces_on_the_table_are_mujocos_contact_forces(fresh):
+    engine, model = fresh
+    at = beside_the_table(model)
+    engine.reset(EVERY, at, STILL)
+    engine.advance(hold(engine), STILL)
+    assert engine.table_force.shape == (WORLDS, 2, 2, 3)
+    for world in range(WORLDS):
+        data = mujoco.MjData(model)
+        data.qpos[:], data.ctrl[:] = at[world], NOMINAL
+        for step in range(2):
+            mujoco.mj_step(model, data)
+            found, expected = engine.table_force[world, step], forces_on_the_robot(model, data)
+            np.testing.assert_allclose(found, expected, atol=0.02 * np.abs(expected).max() + 1e-6)
+    whole, hand = engine.table_force[:, 0].unbind(1)
+    assert not whole[0].any()
+    assert not hand[[0, 2, 3]].any()
+    assert whole[1, 2] > hand[1, 2] > hand[1, :2].norm()  # N, upwards from the top, on which the paddle lies too
+    assert whole[2, 0] < -whole[2, 1:].norm()  # away from its end
+    assert whole[3, 2] > whole[3, :2].norm()
 
 
 def test_applied_force_moves_the_base(fresh):

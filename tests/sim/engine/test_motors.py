@@ -50,10 +50,10 @@ def torques(built, offset, speed):
     return engine.joint_torque.double().numpy()
 
 
-def law(offset, speed, kp: Factor = 1.0, kd: Factor = 1.0, effort: Factor = 1.0):
+def law(offset, speed, kp: Factor = 1.0, kd: Factor = 1.0, effort: Factor = 1.0, no_load: Factor = 1.0):
     """PD, within the lines of both directions of voltage, within the effort."""
     wanted = kp * KP * offset.double().numpy() - kd * KD * speed.double().numpy()
-    back = effort * STALL / SPEED * speed.double().numpy()
+    back = effort * STALL / (no_load * SPEED) * speed.double().numpy()
     return np.clip(np.clip(wanted, -effort * STALL - back, effort * STALL - back), -effort * EFFORT, effort * EFFORT)
 
 
@@ -84,17 +84,22 @@ def test_brakes_give_full_effort_at_any_speed(built, share):
     np.testing.assert_allclose(damped, np.maximum(-KD * speed.numpy(), -EFFORT), atol=1e-4)
 
 
-def test_each_world_has_its_own_gains_and_stall_torque(built):
+def test_each_world_has_its_own_gains_stall_torque_and_no_load_speed(built):
     engine, _ = built
     scales = {
         "kp": torch.linspace(0.8, 1.2, WORLDS),
         "kd": torch.linspace(1.3, 0.7, WORLDS),
         "effort": torch.linspace(0.5, 1.0, WORLDS),
+        "speed": torch.linspace(1.4, 0.9, WORLDS),
+        "ankle_effort": torch.linspace(1.0, 0.6, WORLDS),
     }
     for name, values in scales.items():
         getattr(engine.params, f"{name}_scale").copy_(values)
     engine.apply_params(EVERY)
     columns = {name: values.double().view(-1, 1).numpy() for name, values in scales.items()}
+    columns["no_load"] = columns.pop("speed")
+    at_ankle = np.array(["Ankle" in name for name in JOINT_NAMES])
+    columns["effort"] = columns["effort"] * np.where(at_ankle, columns.pop("ankle_effort"), 1.0)
     generator = torch.Generator().manual_seed(2)
     regimes = {"pd": (0.05, 0.0), "line": (5.0, 0.8), "brake": (-5.0, 0.8)}
     for reach, share in regimes.values():

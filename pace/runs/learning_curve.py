@@ -1,0 +1,53 @@
+"""The learning curve of a run, drawn from its CSV."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from pace.runs.metrics import read_metrics
+
+CURVE = "learning_curve.png"
+CURVE_WINDOW = 40  # rows of the moving average in the plot
+
+
+def moving_average(values: list[float], window: int) -> list[float]:
+    """Mean of the last ``window`` values that are not NaN, at each position."""
+    result: list[float] = []
+    for end in range(1, len(values) + 1):
+        recent = [value for value in values[max(0, end - window) : end] if not math.isnan(value)]
+        result.append(sum(recent) / len(recent) if recent else math.nan)
+    return result
+
+
+def plot_learning_curve(run: str | Path) -> Path | None:
+    """Draw ``learning_curve.png`` from the run's CSV; None when it has fewer than two rows."""
+    from matplotlib.figure import Figure  # imported here: it takes a second that no training should wait for
+
+    metrics = read_metrics(Path(run) / "metrics.csv")
+    if len(metrics.get("update", [])) < 2:
+        return None
+    millions = [samples / 1e6 for samples in metrics["samples"]]
+    panels = (
+        ("share of serves, %", (("hit_rate", "hits", 100.0), ("success_rate", "returns", 100.0))),
+        ("falls per s", (("fall_rate", "falls", 1.0),)),
+        ("predictor RMSE, cm", (("predictor_rmse_cm", "apex", 1.0),)),
+        ("policy std", (("policy_std", "std", 1.0),)),
+    )
+    figure = Figure(figsize=(9, 10), layout="constrained")
+    for axes, (label, curves) in zip(figure.subplots(len(panels), 1, sharex=True), panels, strict=True):
+        for column, name, factor in curves:
+            smooth = moving_average(metrics[column], CURVE_WINDOW)
+            axes.plot(millions, [factor * value for value in smooth], label=name)
+        axes.set_ylabel(label)
+        axes.update_datalim(
+            [(millions[0], 0.0)]
+        )  # zero is in view, and the upper margin is a share of the whole height
+        axes.autoscale_view()
+        axes.set_ylim(bottom=0)
+        axes.grid(alpha=0.3)
+        axes.legend(loc="best")
+    axes.set_xlabel(f"control steps, millions (mean of {CURVE_WINDOW} updates)")
+    file = Path(run) / CURVE
+    figure.savefig(file, dpi=110)
+    return file

@@ -1,0 +1,75 @@
+"""Warp's folder of kernels for a user without a home: a private one in the temporary folder, or one line."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pace.arrays.kernel_cache import private_folder
+from pace.config.base import ConfigError
+
+ROOT = Path(__file__).parents[2]
+#: Another user, who may read everything (this environment belongs to root) and write nothing.
+NOBODY = (
+    "setpriv", "--reuid=65534", "--regid=65534", "--clear-groups", "--inh-caps=-all,+dac_read_search",
+    "--ambient-caps=-all,+dac_read_search", "--bounding-set=-all,+dac_read_search",
+)  # fmt: skip
+COMPILE = """
+import pace.arrays, warp as wp
+@wp.kernel
+def _double(values: wp.array[wp.float32]):
+    values[wp.tid()] = 2.0 * values[wp.tid()]
+values = wp.full(2, 3.0, dtype=wp.float32, device="cpu")
+wp.launch(_double, 2, [values], device="cpu")
+print(values.numpy().tolist(), wp.config.kernel_cache_dir)
+"""
+
+
+def test_a_folder_is_this_users_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tempfile.gettempdir", lambda: str(tmp_path))
+    folder = private_folder("why")
+    assert folder.parent == tmp_path
+    assert folder.stat().st_mode & 0o777 == 0o700
+    assert private_folder("why") == folder
+    folder.chmod(0o777)  # kernels in it could be anybody's
+    with pytest.raises(ConfigError, match=r"why; WARP_CACHE_PATH names another folder .*not this user's alone"):
+        private_folder("why")
+    folder.rmdir()
+    folder.symlink_to(tmp_path)
+    with pytest.raises(ConfigError, match="not this user's alone"):
+        private_folder("why")
+
+
+def as_nobody(folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    if os.getuid() != 0 or shutil.which("setpriv") is None:
+        pytest.skip("only root can be another user")
+    given = {"PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT), "PYTHONDONTWRITEBYTECODE": "1"} | environment
+    line = [*NOBODY, sys.executable, "kernel.py"]
+    (folder / "kernel.py").write_text(COMPILE)
+    return subprocess.run(line, cwd=folder, env=given, capture_output=True, text=True, check=False)
+
+
+def test_a_user_without_a_home_compiles_kernels_in_the_temporary_folder(tmp_path: Path) -> None:
+    shared = Path("/tmp") / f"pace_test_{os.getpid()}"  # pytest's own folders are closed to others
+    shared.mkdir()
+    shared.chmod(0o777)
+    try:
+        done = as_nobody(tmp_path, HOME="/nonexistent", TMPDIR=str(shared))
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.startswith(f"[6.0, 6.0] {shared}/pace_kernels_65534")
+        assert "WARP_CACHE_PATH names no other folder" in done.stderr
+        done = as_nobody(tmp_path, HOME="/nonexistent", WARP_CACHE_PATH=str(shared / "own"))
+        assert done.stdout.startswith(f"[6.0, 6.0] {shared}/own"), done.stderr
+    finally:
+        shutil.rmtree(shared)
+
+
+def test_a_named_folder_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
+    done = as_nobody(tmp_path, HOME="/nonexistent", WARP_CACHE_PATH="/proc/kernels")
+    assert done.returncode == 1
+    assert "WARP_CACHE_PATH: /proc/kernels cannot be made" in done.stderr.splitlines()[-1]
