@@ -160,6 +160,11 @@ def under_torchrun() -> bool:
     return "TORCHELASTIC_RUN_ID" in os.environ
 
 
+def launched_size() -> int:
+    """Processes that ``torchrun`` has started, on all machines; 1 without it."""
+    return int(os.environ["WORLD_SIZE"]) if under_torchrun() else 1
+
+
 def own_device(device: str) -> str:
     """``device``; under ``torchrun``, for ``cuda`` and ``auto``, the GPU of this process's local rank."""
     if under_torchrun() and device in ("auto", "cuda") and torch.cuda.is_available():

@@ -37,7 +37,7 @@ def graphs_of(engine: EngineConfig, device: torch.device) -> Graphs:
         if device.type != "cpu":
             raise ConfigError("engine.graph=dry goes a GPU's way on a CPU: give device=cpu, or engine.graph=auto")
         if engine.name == "native":
-            raise ConfigError("engine.graph=dry goes the way of a GPU's engine: give engine=mjwarp")
+            raise ConfigError("engine.graph=dry takes a GPU's engine: give engine=mjwarp, or engine.graph=auto")
         return Graphs.DRY
     return Graphs.CUDA if engine.graph != "never" and device.type == "cuda" else Graphs.NONE
 

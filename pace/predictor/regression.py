@@ -53,6 +53,8 @@ class PredictorTrainer:
         self.updates = 0
         self.optimiser = adam(parameters, config.learning_rate)
         self._gradients = Gradients(parameters)
+        if self.group.size > 1 or graphs is not Graphs.NONE:
+            self._gradients.hold()
         self._num_worlds, self._device, self._first_steps, self._graphs = num_worlds, device, steps, graphs
         self._edges = torch.tensor(TIME_BINS, device=device)
         self._sums = torch.zeros(2, len(BIN_NAMES), device=device)

@@ -96,6 +96,8 @@ class PPO:
         """The buffers of a minibatch, and the optimiser step on them."""
         batch = minibatch_of(rollout, self._sources(rollout), self.config.minibatches)
         captured = partial(CapturedCall, device=rollout.reward.device, graphs=rollout.env.graphs)
+        if self.group.size > 1 or rollout.env.graphs is not Graphs.NONE:
+            self._gradients.hold()
         if self.group.size == 1:
             return batch, captured(partial(self._step, batch))
         if rollout.env.graphs is Graphs.NONE:

@@ -44,6 +44,7 @@ class Fit:
         self.network = nn.Sequential(nn.Linear(4, 8), nn.ELU(inplace=True), nn.Linear(8, 1))
         parameters = list(self.network.parameters())
         self.gradients, self.optimiser = Gradients(parameters), adam(parameters, 0.1)
+        self.gradients.hold()
         self.generator = torch.Generator().manual_seed(2)
         self.loss = torch.zeros(())
 

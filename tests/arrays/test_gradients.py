@@ -14,6 +14,7 @@ def test_gradients_are_accumulated_in_the_buffer() -> None:
     x = torch.randn(5, 3)
     plain = torch.autograd.grad(second(first(x)).sum(), [*first.parameters(), *second.parameters()])
     gradients = Gradients(list(first.parameters()), list(second.parameters()))
+    gradients.hold()
     of_first, of_second = gradients.parts
     assert (len(gradients.flat), len(of_first), len(of_second)) == (12, 9, 3)
     for _ in range(2):
@@ -25,3 +26,16 @@ def test_gradients_are_accumulated_in_the_buffer() -> None:
     for parameter in [*first.parameters(), *second.parameters()]:
         assert parameter.grad is not None
         assert parameter.grad.untyped_storage().data_ptr() == gradients.flat.untyped_storage().data_ptr()
+
+
+def test_without_a_buffer_they_are_made_again_each_time() -> None:
+    torch.manual_seed(0)
+    network, x = nn.Linear(3, 2), torch.randn(5, 3)
+    gradients, made = Gradients(list(network.parameters())), []
+    for _ in range(2):
+        gradients.zero_()
+        network(x).sum().backward()
+        made.append(network.weight.grad)
+    assert made[0] is not made[1]
+    torch.testing.assert_close(made[0], made[1])
+    assert not gradients.flat.any()
