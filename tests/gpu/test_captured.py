@@ -1,4 +1,4 @@
-"""The parts of an update as CUDA graphs: what a dry run on a CPU cannot show. ``python -m pytest -m gpu -s tests/gpu``."""
+"""The parts of an update as CUDA graphs, which a dry run cannot show: ``python -m pytest -m gpu -s tests/gpu``."""
 
 from __future__ import annotations
 
