@@ -24,6 +24,7 @@ from pace.evaluation.sweep import Variation, ball_presets, plan_cell, variations
 from pace.evaluation.text import text_table
 from pace.predictor.regression import BIN_NAMES
 from pace.rl.policies import built_in_policy, load_policy
+from pace.runs.run_folder import versions
 from pace.task.game import Outcome
 from tests.helpers.saved import make_config, save_run
 
@@ -365,6 +366,8 @@ def test_an_interrupted_sweep_keeps_its_cells_and_goes_on(
         return fake_row(2)
 
     monkeypatch.setattr(evaluate, "evaluate_row", play)
+    same = versions()  # a commit meanwhile would be another version
+    monkeypatch.setattr(evaluate, "versions", lambda: same)
     command = ["policy=zero", f"out={tmp_path}", *SWEEP, "variations.gain=[0.8,1.0,1.2]"]
     assert run_main(monkeypatch, *command) == 130
     printed = capsys.readouterr()

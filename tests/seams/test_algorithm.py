@@ -127,6 +127,7 @@ def test_reinforce_trains_resumes_exactly_and_is_evaluated_and_exported(folder: 
     seen = torch.randn(3, whole.weights["agent"]["weight"].shape[1])
     torch.testing.assert_close(policy(seen), seen @ whole.weights["agent"]["weight"].T + whole.weights["agent"]["bias"])
     table = ("rows=[short]", "serves=4", "num_worlds=4", "engine.threads=1", "progress=false", "physics_dt=0.01")
+    table += ("first_ball=[]",)
     assert command(evaluate, str(folder / "whole"), f"out={folder / 'table'}", *table) == 0
     assert command(export, str(folder / "whole"), f"out={folder / 'exported'}", "check_worlds=2", "check_steps=3") == 0
     assert (folder / "exported").exists()

@@ -117,6 +117,7 @@ def test_observations_from_outside_train_and_need_their_module_again(folder: Pat
     critic = "observation.critic=[apex, outside_sight:true_speed]"
     assert command(train, f"out={run}", f"observation.policy={OBSERVED}", critic, *SMALL) == 0
     table = ("rows=[short]", "serves=4", "num_worlds=4", "engine.threads=1", "progress=false")
+    table += ("physics_dt=0.01", "first_ball=[]")
     with stranger(folder):
         with pytest.raises(CheckpointError, match=r"ball_over_table'.*plugins=\[outside_sight\]"):
             load_policy(run)

@@ -54,7 +54,8 @@ def test_a_reward_is_not_even_looked_for(folder: Path, path: str) -> None:
     run = planted(folder, change)
     policy = load_policy(run)
     policy.make_env(2, "cpu", 1, ["engine.threads=1"]).advance(policy.make_env(2, "cpu").task_state.action)
-    table = ("rows=[short]", "serves=4", "num_worlds=4", "engine.threads=1", "progress=false")
+    table = ("rows=[short]", "serves=4", "num_worlds=4", "engine.threads=1", "progress=false", "physics_dt=0.01")
+    table += ("first_ball=[]",)
     assert command(evaluate, str(run), f"out={folder / 'table'}", *table) == 0
     with pytest.raises(ConfigError, match=r"reward.terms.\w+.function: .*was not named"):
         policy.make_env(2, "cpu", rewards=True)
