@@ -22,6 +22,8 @@ FRAME_COLUMNS = 11
 SEQUENCES = wp.constant(16)
 #: s; a frame that never arrives, and one that is older than all.
 NEVER = wp.constant(1.0e9)
+#: s, age of the ball's frame at the start of an episode with the ball out of view: there is none.
+UNSEEN = wp.constant(1.0e3)
 
 
 @wp.struct
@@ -170,6 +172,7 @@ def _begin(
     cameras: Cameras,
     robot: RobotArrays,
     ball_position: wp.array[wp.vec3],
+    in_view: wp.array[wp.bool],
     film: Film,
 ):
     """The masked worlds' robots know where they stand, from a frame that is as old as their delay; no other is sent."""
@@ -185,11 +188,13 @@ def _begin(
     for column in range(VALUES):
         error = _noise(cameras, film.amplitude, film.slow[world], column, seed[world], 0)
         film.sensed[world, column] = film.truth[world, 0, column] + film.scale[world] * error
+        if column >= 3 and column < 6 and not in_view[world]:
+            film.sensed[world, column] = 0.0
     film.phase[world] = cameras.period * wp.randf(wp.rand_init(seed[world], SEQUENCES - 1))
     film.gap[world] = 0.0
     film.base_age[world] = film.delay[world] * cameras.control_dt
-    film.ball_age[world] = film.delay[world] * cameras.control_dt
-    film.ball_new[world] = True
+    film.ball_age[world] = wp.where(in_view[world], film.delay[world] * cameras.control_dt, UNSEEN)
+    film.ball_new[world] = in_view[world]
 
 
 @wp.kernel
@@ -274,9 +279,9 @@ class Mocap(Stateful):
         self, robot: RobotState, ball_position: Tensor, in_view: Tensor, seed: Tensor
     ) -> tuple[MaskedLaunch, MaskedLaunch]:
         """Launches of a control step (mask: the ball was launched at its end) and of a beginning, for these tensors."""
-        given = {"robot": robot, "ball_position": ball_position, "seed": seed}
+        given = {"robot": robot, "ball_position": ball_position, "seed": seed, "in_view": in_view}
         given |= {"cameras": self._cameras, "film": self._film}
-        advance = MaskedLaunch(_advance, self._count, self._device, in_view=in_view, **given)
+        advance = MaskedLaunch(_advance, self._count, self._device, **given)
         return advance, MaskedLaunch(_begin, self._count, self._device, **given)
 
 

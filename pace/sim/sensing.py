@@ -14,7 +14,7 @@ from torch import Tensor
 from pace.arrays.launch import Bound, MaskedLaunch
 from pace.arrays.state import Stateful, with_prefix
 from pace.config.sim import SensingConfig
-from pace.sim.mocap import Mocap
+from pace.sim.mocap import UNSEEN, Mocap
 from pace.sim.robot_state import RobotArrays, RobotState
 
 #: Columns of a motion-capture frame: base position 3, ball position 3, heading 2; 1 in a new ball's first frame; 1 if
@@ -44,7 +44,7 @@ def _see(
     for i in range(2):
         line[0, HEADING + i] = robot.heading[world][i]
     line[0, LAUNCHED] = wp.where(new_ball and not new_world, 1.0, 0.0)
-    line[0, SEEN] = wp.where(in_view or new_world, 1.0, 0.0)
+    line[0, SEEN] = wp.where(in_view, 1.0, 0.0)
     if new_world:
         for age in range(1, line.shape[0]):
             for column in range(line.shape[1]):
@@ -121,6 +121,10 @@ def _sense(
     for column in range(LAUNCHED):
         if seen or column < BALL or column >= HEADING:
             row[mocap + column] += _late(line[world], delay[world], column)
+        elif reset == 1:
+            row[mocap + column] = 0.0
+    if reset == 1 and not seen:
+        ball_age[world] = UNSEEN - control_dt
     ball_new[world] = seen
     ball_age[world] = wp.where(seen, delay[world] * control_dt, ball_age[world] + control_dt)
 
@@ -131,7 +135,9 @@ class Sensing(Stateful):
     All signals have uniform noise, whose amplitudes have a common scale that is sampled per world at reset. Motion
     capture (base position, heading, ball) also has a delay that is sampled per world at reset, linearly interpolated
     between the control steps around it. A new ball is sensed once the delay has passed since its launch, the old one
-    until then; nothing tells them apart. With ``config.mocap.rate`` motion capture has frames of its own instead
+    until then; nothing tells them apart. An episode begins as if its ball had been where it is for long. A ball that is
+    out of view then is sensed at the origin, in a frame that is ``UNSEEN`` s old, until the first frame shows it.
+    With ``config.mocap.rate`` motion capture has frames of its own instead
     (:class:`pace.sim.mocap.Mocap`), and both signals keep the newest that has arrived.
 
     Attributes: ``base_angular_velocity`` (N, 3) rad/s body frame, ``projected_gravity`` (N, 3), ``joint_position``

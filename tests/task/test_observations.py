@@ -220,9 +220,22 @@ def policy_input(env: TableTennisEnv, change: Any = None) -> tuple[Tensor, Tenso
 SHORT = ("engine=native", "engine.threads=1", "observation=memory", "serve.max_duration=0.4", "sensing=wide")
 
 
-def test_the_actor_sees_launches_hits_and_resets_through_sensed_frames_alone() -> None:
+PAUSED = ("serve.pause=[0.0,0.2]", "serve.first_pause=[0.0,0.2]", "serve.pause_ball={lies:0.4,carried:0.3,hidden:0.3}")
+
+
+def strike(env: TableTennisEnv) -> None:
+    """Put the ball of every other world in front of its paddle, flying into it after a bounce."""
+    robot, ball, every_other = env.worlds.robot, env.worlds.ball, slice(None, None, 2)
+    normal = robot.paddle_normal * robot.paddle_normal[:, :1].sign()
+    ball.position[every_other] = (robot.paddle_position + 0.1 * normal)[every_other]
+    ball.velocity[every_other] = (robot.paddle_velocity - 6.0 * normal)[every_other]
+    env.game.referee.own_bounces[every_other] = 1
+
+
+@pytest.mark.parametrize("more", [(), PAUSED, ("sensing=mocap", *PAUSED)], ids=["wide", "pauses", "mocap"])
+def test_the_actor_sees_launches_hits_and_resets_through_sensed_frames_alone(more: tuple[str, ...]) -> None:
     """Other modules, given only the readings, make the same policy observation, bit for bit."""
-    env = TableTennisEnv(config(*SHORT), 8, "cpu", 3, TruePredictor())
+    env = TableTennisEnv(config(*SHORT, *more), 8, "cpu", 3, TruePredictor())
     names = (*Readings._fields, "base_shift_noise")
     sensing: Any = SimpleNamespace(**{name: getattr(env.sensing, name).clone() for name in names})
     action, everyone = env.task_state.action.clone(), torch.ones(8, dtype=torch.bool)
@@ -237,9 +250,12 @@ def test_the_actor_sees_launches_hits_and_resets_through_sensed_frames_alone() -
 
     apart.begin(everyone)
     history.fill(everyone)
-    launches, begun = 0, 0
+    launches, begun, hits = 0, 0, 0
     for step in range(70):
+        if step % 10 == 5:
+            strike(env)
         env.advance(0.3 * torch.randn(8, 21))
+        hits += int(env.game.referee.hit_now.sum())
         read()
         apart.step()
         history.push()
@@ -254,6 +270,7 @@ def test_the_actor_sees_launches_hits_and_resets_through_sensed_frames_alone() -
         assert torch.equal(history.observation, env.policy_observation), step
     assert launches >= 16
     assert begun >= 16
+    assert hits >= 8
 
 
 def test_the_predictor_learns_from_no_step_in_which_the_old_ball_is_sensed() -> None:

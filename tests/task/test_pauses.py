@@ -115,6 +115,25 @@ def test_a_hidden_ball_is_out_of_view_until_it_is_served() -> None:
     assert env.worlds.ball.in_view.all()
 
 
+@pytest.mark.parametrize("sensing", ["paper", "mocap"])
+def test_a_robot_that_saw_no_ball_yet_senses_none_until_a_frame_shows_one(sensing: str) -> None:
+    env = make("hidden", "serve.first_pause=[0.1,0.1]", f"sensing={sensing}", "sensing.mocap.lost=0.0")
+    env.sensing.ball_position.fill_(1.0)  # of the episode before
+    env.reset_worlds(torch.ones(N, dtype=torch.bool))
+    for _ in range(5):
+        assert not env.worlds.ball.in_view.any()
+        assert env.sensing.ball_position.abs().max() == 0.0
+        assert not env.sensing.ball_new.any()
+        assert bool((env.sensing.ball_age > 999.0).all())
+        assert not env.actor.track.something_to_hit.any()
+        step(env)
+    for _ in range(3):  # delay and jitter are below 2 control steps
+        step(env)
+    torch.testing.assert_close(env.sensing.ball_position, env.worlds.ball.position, atol=0.4, rtol=0.0)
+    assert bool((env.sensing.ball_age < 0.05).all())
+    assert env.actor.track.something_to_hit.all()
+
+
 def test_a_fall_in_a_pause_ends_the_episode_and_no_serve() -> None:
     env = make("hidden", "serve.pause=[1.0,1.0]", "serve.first_pause=[0.0,0.0]")
     end_serves(env)
