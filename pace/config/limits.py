@@ -73,6 +73,7 @@ LIMITS: dict[str, dict[str, Limits]] = {
         "paddle_tangential_restitution": (-2.0, 2.0), "paddle_drilling_loss": SIGNED_SHARE, "backlash": SHARE,
         "paddle_tilt": (0.0, 1.5), "paddle_shift": SHARE, "speed_scale": (1e-3, 100.0),
         "ankle_effort_scale": (1e-3, 100.0), "joint_friction": (0.0, 1000.0), "joint_damping": (0.0, 1000.0),
+        "preset_share": SHARE,
     },
     "MocapConfig": {
         "rate": (0.0, 10_000.0), "white_noise": AMPLITUDE, "slow_noise": AMPLITUDE, "slow_noise_time": (TINY, 1000.0),
@@ -107,6 +108,11 @@ LIMITS: dict[str, dict[str, Limits]] = {
     "ReturnMemoryConfig": {
         "prior": AMPLITUDE, "prior_hits": (TINY, 1e6), "hits": (1.0, 1e6), "reach": (TINY, 100.0),
         "closing_speed": (TINY, 100.0), "largest": (TINY, 100.0),
+    },
+    "RubberMemoryConfig": {
+        "prior": AMPLITUDE, "prior_hits": (TINY, 1e6), "hits": (1.0, 1e6), "reach": (TINY, 100.0),
+        "closing_speed": (TINY, 100.0), "largest": (TINY, 100.0), "bounce_spin": (0.0, 1e4), "radius": (TINY, 1.0),
+        "prior_grip": AMPLITUDE, "slip": (TINY, 100.0), "largest_grip": (TINY, 100.0),
     },
     "DelayEstimateConfig": {"prior": SECONDS, "prior_worth": (TINY, 1e6), "smoothing": SHARE, "fading": SHARE},
     "AttitudeEstimateConfig": {"gain": SHARE},

@@ -103,10 +103,11 @@ class RandomizationConfig:
     ankle_effort_scale: Range = field(default_factory=lambda: [1.0, 1.0])  # times effort_scale, of the group ankles
     joint_friction: Range = field(default_factory=lambda: [0.0, 0.0])  # N m, dry, added in every joint
     joint_damping: Range = field(default_factory=lambda: [0.0, 0.0])  # N m s/rad, added in every joint
+    preset_share: float = 0.0  # probability that a world's ball, air and contacts are those of ball=
 
     def __post_init__(self) -> None:
         for f in fields(self):
-            if f.name != "name":
+            if f.name not in ("name", "preset_share"):
                 check_range(f"randomization.{f.name}", getattr(self, f.name))
         for name in ("actuator_delay", "backlash", "paddle_tilt", "paddle_shift"):
             check_range(f"randomization.{name}", getattr(self, name), lowest=0.0)
@@ -114,6 +115,7 @@ class RandomizationConfig:
             require(getattr(self, name)[0] > 0, f"randomization.{name} must be positive")
         for name in ("joint_friction", "joint_damping"):
             require(getattr(self, name)[0] >= 0, f"randomization.{name} must not be negative")
+        require(0.0 <= self.preset_share <= 1.0, "randomization.preset_share must lie within 0 and 1")
 
 
 @dataclass

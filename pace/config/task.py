@@ -156,6 +156,24 @@ class ReturnMemoryConfig:
 
 
 @dataclass
+class RubberMemoryConfig(ReturnMemoryConfig):
+    """Numbers of the memory of returns and of the rubber's grip (:class:`pace.onboard.rubber.RubberMemory`)."""
+
+    bounce_spin: float  # rad/s, topspin that a ball is taken to have when it is hit
+    radius: float  # m, of the ball
+    prior_grip: float  # share of the slip that a contact takes, before the first hit
+    slip: float  # m/s; hits with less of it are ignored
+    largest_grip: float  # largest single estimate
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("radius", "slip", "largest_grip"):
+            require(getattr(self, name) > 0, f"observation.rubber_memory.{name} must be positive")
+        require(self.bounce_spin >= 0, "observation.rubber_memory.bounce_spin must not be negative")
+        require(0 <= self.prior_grip <= self.largest_grip, "observation.rubber_memory.prior_grip: 0 to largest_grip")
+
+
+@dataclass
 class DelayEstimateConfig:
     """Numbers of the estimate of motion capture's delay (:class:`pace.onboard.delay.DelayEstimate`)."""
 
@@ -211,6 +229,7 @@ class ObservationConfig:
     delay_estimate: DelayEstimateConfig | None = None
     attitude_estimate: AttitudeEstimateConfig | None = None
     joint_estimate: JointEstimateConfig | None = None
+    rubber_memory: RubberMemoryConfig | None = None
     estimates: dict[str, Any] = field(default_factory=dict)  # of those that are registered from outside, by their key
 
     def built_in(self) -> dict[str, Any]:
@@ -220,6 +239,7 @@ class ObservationConfig:
             "delay_estimate": self.delay_estimate,
             "attitude_estimate": self.attitude_estimate,
             "joint_estimate": self.joint_estimate,
+            "rubber_memory": self.rubber_memory,
         }
 
     def numbers(self) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from pace.config.task import (
     JointEstimateConfig,
     ObservationConfig,
     ReturnMemoryConfig,
+    RubberMemoryConfig,
     TaskConfig,
 )
 from pace.onboard import returns
@@ -30,6 +31,7 @@ from pace.onboard.delay import DelayEstimate
 from pace.onboard.estimate import Estimate
 from pace.onboard.joints import JointEstimate
 from pace.onboard.returns import ReturnMemory
+from pace.onboard.rubber import RubberMemory
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,14 @@ ESTIMATES: dict[str, Entry] = {
         ReturnMemory,
         ("track", "turned", "paddle_position", "paddle_normal"),
         {"last_return": "last_return"},
+        frames=returns.FRAMES,
+    ),
+    "rubber": Entry(
+        "rubber_memory",
+        RubberMemoryConfig,
+        RubberMemory,
+        ("track", "turned", "paddle_position", "paddle_normal"),
+        {"last_rubber": "last_rubber"},
         frames=returns.FRAMES,
     ),
     "delay": Entry("delay_estimate", DelayEstimateConfig, DelayEstimate, _TURNS, {"sensed_delay": "delay"}),

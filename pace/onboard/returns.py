@@ -55,18 +55,19 @@ class ReturnMemory(Estimate):
         }
 
     def begin(self, track: Tensor, turned: Tensor, paddle_position: Tensor, paddle_normal: Tensor) -> Tensor:
-        """The state (N, 24): zeros."""
+        """The state (N, ``size``): zeros."""
         return paddle_position.new_zeros(1, self.size).expand(paddle_position.shape[0], -1)
 
     def forward(
         self, state: Tensor, track: Tensor, turned: Tensor, paddle_position: Tensor, paddle_normal: Tensor
     ) -> Tensor:
-        """The state (N, 24) after this step.
+        """The state (N, ``size``) after this step.
 
-        Args: state (N, 24) before it; track (N, 3 * frames) m, the ball's last positions, oldest first; turned (N,)
-        bool, the ball was sensed moving away; position (N, 3) m and normal (N, 3) of the paddle.
+        Args: state (N, ``size``) before it; track (N, 3 * frames) m, the ball's last positions, oldest first;
+        turned (N,) bool, the ball was sensed moving away; position (N, 3) m and normal (N, 3) of the paddle.
         """
-        last_age, last, second_last, last_normal, last_hit, seen = state.split([1, 3, 3, 3, 9, 5], dim=1)
+        columns = [1, 3, 3, 3, 9, self.size - 19]
+        last_age, last, second_last, last_normal, last_hit, seen = state.split(columns, dim=1)
         ball = track.unflatten(1, (-1, 3))
         newest, speed = ball[:, -1], (ball[:, -1] - ball[:, -3]) / self.span
         age = torch.where(turned.unsqueeze(1), (last_age + 1.0).clamp(max=4.0), 0.0)
@@ -87,13 +88,18 @@ class ReturnMemory(Estimate):
         """
         config = self.config
         before, paddle, normal = hit.split(3, dim=1)
-        restitution, share = seen[:, 3:4], seen[:, 4:5]
         closing = ((before - paddle) * normal).sum(1, keepdim=True)
         parting = ((after + self.fall - paddle) * normal).sum(1, keepdim=True)
         fast = closing.abs() >= config.closing_speed
-        estimate = (-parting / torch.where(fast, closing, 1.0)).clamp(0.0, config.largest)
-        hits = (share * config.hits).clamp(max=config.hits - 1.0)  # with more hits, older ones fade
+        estimate = (-parting / torch.where(fast, closing, 1.0)).clamp(0.0, config.largest) - config.prior
+        return torch.cat((after, self._mean(seen[:, 3:5], estimate, fast)), dim=1)
+
+    def _mean(self, known: Tensor, estimate: Tensor, counts: Tensor) -> Tensor:
+        """A mean and the share of hits that it is of, ``known`` (N, 2), with one more ``estimate`` (N, 1), both minus
+        the prior, where it ``counts`` (N, 1) bool; with more than ``hits``, older ones fade."""
+        config = self.config
+        mean, share = known.split(1, dim=1)
+        hits = (share * config.hits).clamp(max=config.hits - 1.0)
         weight = hits + config.prior_hits
-        mean = (restitution * weight + estimate - config.prior) / (weight + 1.0)
-        learned = torch.cat((mean, (hits + 1.0) / config.hits), dim=1)
-        return torch.cat((after, torch.where(fast, learned, seen[:, 3:])), dim=1)
+        learned = torch.cat(((mean * weight + estimate) / (weight + 1.0), (hits + 1.0) / config.hits), dim=1)
+        return torch.where(counts, learned, known)

@@ -13,8 +13,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from pace.arrays.draws import Column, UniformSampler, columns_of
-from pace.arrays.launch import Launch, MaskedLaunch
+from pace.arrays.draws import Column, ColumnArrays, UniformSampler, columns_of
+from pace.arrays.launch import Launch, MaskedLaunch, table
 from pace.arrays.state import Stateful, tensors_named, with_prefix
 from pace.arrays.tensors import allocate
 from pace.config.ball import BallConfig
@@ -80,6 +80,16 @@ def _mount_paddle(mask: wp.array[wp.bool], error: wp.array2d[wp.float32], mount:
     height, around = error[world, 4], error[world, 3]
     radius = wp.sqrt(wp.max(1.0 - height * height, 0.0))
     mount.offset[world] = error[world, 2] * wp.vec3(height, radius * wp.cos(around), radius * wp.sin(around))
+
+
+@wp.kernel
+def _keep_preset(mask: wp.array[wp.bool], choice: wp.array[wp.float32], share: float, nominal: wp.array[ColumnArrays]):
+    """Put the preset's numbers, the low ends of ``nominal``, into a share of the masked worlds."""
+    world = wp.tid()
+    if not mask[world] or choice[world] >= share:
+        return
+    for i in range(nominal.shape[0]):
+        nominal[i].values[world] = nominal[i].low
 
 
 @wp.kernel
@@ -156,7 +166,14 @@ class Randomizer(Stateful):
         self.push = torch.zeros(num_worlds, num_velocities, device=device)
         self.pushes_enabled = config.push_interval[1] > 0.0
         self._until_push = torch.zeros(num_worlds, device=device)
-        self._sample = UniformSampler(self._columns(), generator)
+        self._choice = torch.zeros(num_worlds, device=device)
+        self._sample = UniformSampler([*self._columns(), Column(self._choice, 0.0, 1.0)], generator)
+        presets = [
+            Column(getattr(ball_params, name), low=value, high=value) for name, value in self._nominal_ball.items()
+        ]
+        nominal = table(ColumnArrays, presets, device)
+        kept = {"choice": self._choice, "share": config.preset_share, "nominal": nominal}
+        self._keep_preset = MaskedLaunch(_keep_preset, num_worlds, device, **kept)
         self._seed = torch.zeros(1, dtype=torch.int32, device=device)
         sampled = {"interval": config.push_interval, "velocity": config.push_velocity, "seed": self._seed}
         kept = {"until_push": self._until_push, "push": self.push}
@@ -190,6 +207,7 @@ class Randomizer(Stateful):
     def sample(self, mask: Tensor) -> None:
         """Resample the parameters of the worlds of ``mask`` (N,) bool."""
         self._sample(mask)
+        self._keep_preset(mask)
         self._mount(mask)
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:

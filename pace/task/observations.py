@@ -147,6 +147,9 @@ CRITIC |= {
     # of each world: the restitution is that at speed zero
     "paddle_restitution": CriticObservation(1, lambda s: _column(torch.as_tensor(s.ball.params.paddle_restitution))),
     "paddle_friction": CriticObservation(1, lambda s: _column(torch.as_tensor(s.ball.params.paddle_friction))),
+    "paddle_tangential_restitution": CriticObservation(
+        1, lambda s: _column(torch.as_tensor(s.ball.params.paddle_tangential_restitution))
+    ),
     "mocap_delay": CriticObservation(1, lambda s: _column(s.mocap_delay)),
 }
 
