@@ -23,10 +23,11 @@ from pace.config.schedules import START, position_of
 from pace.config.training import RESUME_KEYS, TrainConfig
 from pace.cores import threads_of
 from pace.devices import has_bf16, machine_of, resolve_device
-from pace.distributed import ProcessGroup, launched_size, own_device, process_group, suitable_size
+from pace.distributed import ProcessGroup, is_first_here, launched_size, own_device, process_group, suitable_size
 from pace.predictor.network import BallPredictor, make_predictor
 from pace.predictor.priors import resolve_priors
 from pace.rl.curriculum import Curriculum
+from pace.rl.kernels import warm
 from pace.rl.plan import in_millions
 from pace.rl.policies import locate
 from pace.rl.trainer import Summary, Trainer, device_type_of, restarts_worlds
@@ -57,6 +58,8 @@ def train_from_config(composed: DictConfig) -> None:
     else:
         chosen = adapt(config, saved, device, overrides)
     config.processes = config.processes or suitable_size(config.num_worlds, device)
+    if is_first_here():
+        warm(config, device)  # before any clock runs, and once for all processes of this machine
     arguments = overrides if hydra.mode == RunMode.MULTIRUN else None  # of this job; the command's are of all
     with process_group(config.processes, device, arguments) as group:
         trainer = build_trainer(config, saved, device, group)
