@@ -12,7 +12,7 @@ import pace
 TESTS = Path(__file__).parent
 ROOM = Path(pace.__file__).parent
 #: Folders that are no rooms: what all tests share, and extensions of several rooms from outside.
-OTHERS = {"helpers", "seams"}
+OTHERS = {"gpu", "helpers", "seams"}
 
 
 def files() -> list[Path]:
