@@ -165,6 +165,11 @@ def launched_size() -> int:
     return int(os.environ["WORLD_SIZE"]) if under_torchrun() else 1
 
 
+def is_first_here() -> bool:
+    """Whether this is the first process of a run on its machine, which prepares what all of them use."""
+    return MEMBERSHIP not in os.environ and (not under_torchrun() or os.environ["LOCAL_RANK"] == "0")
+
+
 def own_device(device: str) -> str:
     """``device``; under ``torchrun``, for ``cuda`` and ``auto``, the GPU of this process's local rank."""
     if under_torchrun() and device in ("auto", "cuda") and torch.cuda.is_available():

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from pace.config.base import ConfigError
+from pace.config.schedules import START
 from pace.config.training import load_train_config
 from pace.distributed import ProcessGroup, ProcessGroupError, own_device, process_group, suitable_size
 from pace.predictor.network import PredictorNetwork
@@ -28,7 +29,7 @@ from pace.rl.rollout import Rollout, RolloutError
 from pace.rl.trainer import Trainer, restarts_worlds
 from pace.runs.checkpoint import flatten_tensors, load_checkpoint
 from pace.runs.metrics import read_metrics
-from tests.helpers.algo import CPU, small_algo
+from tests.helpers.algo import CPU, IN_SAMPLES, small_algo
 from tests.helpers.dummy import DummyTask
 
 STEPS, WORLDS = 6, 32
@@ -118,7 +119,7 @@ def filled_rollout(agent: Agent, worlds: slice) -> Rollout:
 
 def test_two_halves_learn_what_the_whole_does() -> None:
     def learn(agent: Agent, worlds: slice, group: ProcessGroup) -> dict[str, float]:
-        return PPO(agent, small_algo(epochs=1, minibatches=1), group).update(filled_rollout(agent, worlds), 0.0)
+        return PPO(agent, small_algo(epochs=1, minibatches=1), group).update(filled_rollout(agent, worlds), START)
 
     whole, halves = agent_of(), (agent_of(), agent_of())
     metrics = learn(whole, slice(0, WORLDS), ProcessGroup())
@@ -281,7 +282,7 @@ def test_another_number_of_processes_resumes_what_was_learned() -> None:
 UPDATE = 8 * 12
 SMALL = (
     "num_worlds=8", "processes=2", "algo.steps=12", "algo.actor_hidden=[32]", "algo.critic_hidden=[32]",
-    "predictor.batches_per_update=2", "progress=false", "tensorboard=false",
+    "predictor.batches_per_update=2", "progress=false", "tensorboard=false", *IN_SAMPLES,
 )  # fmt: skip
 
 

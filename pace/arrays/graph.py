@@ -83,12 +83,12 @@ class CapturedCall:
             self._function(*values)
         elif self._inputs is None:
             self._inputs = tuple(value.clone(memory_format=torch.contiguous_format) for value in values)
-            with _as_one():
+            with as_one():
                 self._warm_up(self._inputs)
         else:
             for own, value in zip(self._inputs, values, strict=True):
                 own.copy_(value)
-            with _as_one():
+            with as_one():
                 if self._graph is None:
                     self._graph = self._capture(self._inputs)
                 self._graph.replay()
@@ -180,7 +180,7 @@ class RecordedLaunches:
 
 
 @contextmanager
-def _as_one() -> Iterator[None]:
+def as_one() -> Iterator[None]:
     """Nested calls become part of the outer call."""
     CapturedCall._running = True
     try:

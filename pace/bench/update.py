@@ -14,6 +14,7 @@ from torch import Tensor
 from pace.arrays.graph import Graphs
 from pace.bench.timing import median_seconds
 from pace.config.commands import BenchConfig, BenchOptions
+from pace.config.schedules import START
 from pace.config.training import AlgoConfig, load_train_config
 from pace.rl.agent import Agent, compute_dtype
 from pace.rl.ppo import PPO
@@ -59,7 +60,7 @@ def our_update(options: BenchOptions, algo: AlgoConfig, precision: str, device: 
         rollout.step(step)
     rollout.finish(algo.gamma, algo.gae_lambda)
     learner = PPO(agent, algo)
-    return lambda: learner.update(rollout, 0.0)
+    return lambda: learner.update(rollout, START)
 
 
 def rsl_rl_update(options: BenchOptions, algo: AlgoConfig, mixed_precision: bool, device: torch.device) -> Call:

@@ -217,4 +217,16 @@ COMMANDS = {
         examples=("parity worlds=16", "steps solver run=pretrained/pace", "predictor serves=512 cases=[rubber]"),
         rest="studies",
     ),
+    "warm": Command(
+        module="pace.rl.warm",
+        work="pace.rl.kernels:warm_from_config",
+        config="warm",
+        summary="compile the kernels of a training run, so that it begins at once",
+        about="pace train does this first on a machine that has none. With arch=sm_90 it compiles for a GPU that is "
+        "not there: WARP_CACHE_PATH names the folder, which may be copied to a machine with the GPU.",
+        examples=("device=cuda", "arch=sm_90 experiment=generalist     # for an image that is built without a GPU"),
+        groups=TRAIN_GROUPS,
+        training_keys=("device", "curriculum", "plugins"),
+        refused=dict.fromkeys(("samples", "minutes", "out", "resume"), "nothing is trained"),
+    ),
 }

@@ -28,6 +28,8 @@ class DeviceValues:
     num_worlds: int  # for each device
     steps: int
     minibatches: int
+    samples: float  # control steps of a run, if neither its samples nor its minutes are given
+    minutes: float
     memory: float  # GiB, of a run without worlds
     memory_per_world: float  # GiB
 
@@ -53,6 +55,7 @@ def choose(composed: DictConfig, machine: Machine) -> tuple[DictConfig, dict[str
     chosen = {key: values[key] for key in KEYS if key in values and OmegaConf.select(found, key) == AUTO}
     for key, value in chosen.items():
         OmegaConf.update(found, key, value)
+    _choose_the_end(found, _given(machine))
     return found, chosen
 
 
@@ -66,9 +69,22 @@ def left_open(composed: DictConfig) -> set[str]:
     return {key for key in KEYS if OmegaConf.select(composed, key) == AUTO}
 
 
-def _values(machine: Machine) -> dict[str, Any]:
+def _given(machine: Machine) -> DeviceValues:
     table = OmegaConf.load(config_dir() / "algo" / "_auto.yaml")
-    given = parse(OmegaConf.select(table, machine.kind), DeviceValues)
+    return parse(OmegaConf.select(table, machine.kind), DeviceValues)
+
+
+def _choose_the_end(config: DictConfig, given: DeviceValues) -> None:
+    """``samples`` and ``minutes``, if they are open: one that is given is the only limit."""
+    samples, minutes = (OmegaConf.select(config, key) for key in ("samples", "minutes"))
+    if samples == AUTO:
+        config.samples = given.samples if minutes in (AUTO, 0) else math.inf
+    if minutes == AUTO:
+        config.minutes = given.minutes if samples in (AUTO, math.inf) else 0.0
+
+
+def _values(machine: Machine) -> dict[str, Any]:
+    given = _given(machine)
     worlds = _worlds_that_fit(given, machine.memory) * machine.count
     values: dict[str, Any] = {"num_worlds": worlds, "algo.steps": given.steps, "algo.minibatches": given.minibatches}
     if machine.bf16 is not None:

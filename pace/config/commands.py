@@ -44,6 +44,13 @@ class BenchConfig(TrainConfig):
 
 
 @dataclass
+class WarmConfig(TrainConfig):
+    """``python -m pace.rl.warm``: the training whose kernels to compile, and for what."""
+
+    arch: str | None  # sm_90; None: for the device
+
+
+@dataclass
 class PaperRow:
     """A row of the paper's table II."""
 

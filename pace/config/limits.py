@@ -126,7 +126,8 @@ LIMITS: dict[str, dict[str, Limits]] = {
         "batches_per_update": (1, 10**6), "train_updates": (0, 10**9),
     },
     "TaskConfig": {"landing_target": PLACE},
-    "SchedulePoint": {"samples": SAMPLES, "value": (0.0, 1e6)},
+    "Begin": {"samples": SAMPLES, "share": SHARE},
+    "SchedulePoint": {"value": (0.0, 1e6)},
     "AlgoConfig": {
         "steps": (1, 10_000), "epochs": (1, 1000), "minibatches": (1, 10**6), "actor_hidden": SIZE,
         "critic_hidden": SIZE, "gamma": SHARE, "gae_lambda": SHARE, "clip": (TINY, 1e6),
@@ -134,10 +135,12 @@ LIMITS: dict[str, dict[str, Limits]] = {
         "learning_rate_min": (0.0, 10.0), "learning_rate_max": (0.0, 10.0), "max_grad_norm": (TINY, 1e9),
         "observation_clip": (TINY, 1e9), "last_layer_gain": FACTOR, "fp32_below": AMPLITUDE, "params": ANY,
     },
-    "Stage": {"samples": SAMPLES},
+    "PlanConfig": {
+        "warm_up": (0, 10**6), "updates": COUNT, "seconds": SECONDS, "samples": (1.0, 1e15),
+    },
     "DeviceValues": {
         "num_worlds": (1, 2**24), "steps": (1, 10_000), "minibatches": (1, 10**6), "memory": (0.0, 1e6),
-        "memory_per_world": (0.0, 1e3),
+        "memory_per_world": (0.0, 1e3), "samples": (1.0, 1e15), "minutes": MINUTES,
     },
     "TrainConfig": {
         "num_worlds": (1, 2**24), "processes": (0, 4096), "seed": SEED,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -13,6 +12,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from pace.config.base import ConfigError, compose, parse, to_dict
 from pace.config.names import check_choice, check_renamed
+from pace.config.schedules import END, Position, begin_in_words
 from pace.config.training import TrainConfig
 
 #: Groups of configs/ whose choice may change for a saved policy; networks and observations may not.
@@ -28,19 +28,19 @@ CHANGEABLE = (*TASK_GROUPS, "engine", *TASK_VALUES)
 ON_A_CPU = ("engine=native", "engine.threads=1", "engine.graph=auto")
 
 
-def stage_tasks(config: TrainConfig, samples: float = math.inf) -> list[TrainConfig]:
-    """``config``, then each stage of its curriculum that has begun by ``samples``, applied to the one before.
+def stage_tasks(config: TrainConfig, at: Position = END) -> list[TrainConfig]:
+    """``config``, then each stage of its curriculum that is reached ``at`` a place, applied to the one before.
 
     Errors: :class:`ConfigError`, which names the stage, for a change of an unknown key.
     """
     tasks = [config]
     for stage in config.curriculum:
-        if stage.samples > samples:
+        if not stage.reached(at):
             break
         try:
             tasks.append(override_task(tasks[-1], stage.task))
         except ConfigError as error:
-            raise ConfigError(f"curriculum, from {stage.samples:g} control steps on: {error}") from error
+            raise ConfigError(f"curriculum, from {begin_in_words(stage)} on: {error}") from error
     return tasks
 
 

@@ -11,15 +11,8 @@ from pace.config import automatic, plugins
 from pace.config.base import Completed, compose, parse, require
 from pace.config.names import check_renamed
 from pace.config.predictor import FRAME_DT
+from pace.config.schedules import Position, SchedulePoint, Stage, check_begins, in_shares
 from pace.config.task import TaskConfig
-
-
-@dataclass
-class SchedulePoint:
-    """A value from ``samples`` control steps on; between points it is interpolated linearly."""
-
-    samples: float
-    value: float
 
 
 @dataclass
@@ -49,21 +42,28 @@ class AlgoConfig:
     last_layer_gain: float
     # mixed (bf16, and fp32 from a std of fp32_below on), bf16, fp32; auto: mixed if the hardware supports it, else fp32
     autocast: str
-    later_steps: list[SchedulePoint] = field(default_factory=list)  # in place of steps from that many control steps on
+    later_steps: list[SchedulePoint] = field(default_factory=list)  # in place of steps, from a place in the run on
     fp32_below: float = 0.0  # mean std of the policy below which autocast=mixed computes in float32
     algorithm: str = "ppo"  # or a class from outside: my_module:MyAlgorithm
     params: dict[str, float] = field(default_factory=dict)  # numbers of an algorithm from outside
     observation_norm: bool = True  # by running mean and std; off: observations in their own units, clipped
 
-    def steps_at(self, samples: float) -> int:
-        """Control steps of a world per update, ``samples`` control steps into the run."""
-        due = [point for point in self.later_steps if point.samples <= samples]
-        return int(max(due, key=lambda point: point.samples).value) if due else self.steps
+    @property
+    def schedules(self) -> dict[str, list[SchedulePoint]]:
+        """All schedules by their keys."""
+        return {name: getattr(self, name) for name in ("entropy", "std", "kl_target", "later_steps")}
+
+    def steps_at(self, at: Position) -> int:
+        """Control steps of a world per update, at a place in the run."""
+        due = [point for point in self.later_steps if point.reached(at)]
+        return int(max(due, key=lambda point: point.place).value) if due else self.steps
 
     def __post_init__(self) -> None:
         known = self.algorithm == "ppo" or plugins.may_be_outside(plugins.ALGORITHMS, self.algorithm)
         wanted = "ppo, or come from a module named in plugins=[...]"
         require(known, f"algo.algorithm must be {wanted}, not {self.algorithm!r}")
+        for name, points in self.schedules.items():
+            check_begins(f"algo.{name}", points)
         for point in self.later_steps:
             whole = point.value >= 1 and point.value == int(point.value)
             require(whole, f"algo.later_steps: {point.value} is no number of steps")
@@ -88,11 +88,13 @@ class AlgoConfig:
 
 
 @dataclass
-class Stage:
-    """Changes of the task from ``samples`` control steps of a run on: overrides as ``sensing=wide``."""
+class PlanConfig:
+    """How the number of control steps is planned that the shares of schedules are of (:class:`pace.rl.plan.Plan`)."""
 
-    samples: float
-    task: list[str]
+    warm_up: int = 5  # updates before the speed is measured
+    updates: int = 20  # over which it is measured, and
+    seconds: float = 2.0  # at least
+    samples: float = 84.0e6  # planned for a run without an end
 
 
 @dataclass
@@ -116,6 +118,7 @@ class TrainConfig(TaskConfig, Completed):
     # a run folder or checkpoint whose predictor to start from, instead of that of init_from
     predictor_from: str | None = field(default=None, kw_only=True)
     curriculum: list[Stage] = field(default_factory=list, kw_only=True)  # each changes the task of the one before
+    plan: PlanConfig = field(default_factory=PlanConfig, kw_only=True)
     plugins: list[str] = field(default_factory=list, kw_only=True)  # modules that add terms, observations, ...
 
     @classmethod
@@ -137,9 +140,15 @@ class TrainConfig(TaskConfig, Completed):
         require(self.minutes >= 0, f"minutes must not be negative (0: no limit), got {self.minutes}")
         require(not (self.resume and self.init_from), "give resume or init_from, not both")
         require(not (self.resume and self.predictor_from), "give resume or predictor_from, not both")
-        begins = [stage.samples for stage in self.curriculum]
+        check_begins("curriculum", self.curriculum)
+        begins = [stage.place for stage in self.curriculum]
         require(begins == sorted(set(begins)), f"curriculum: the stages must begin one after another, got {begins}")
         require(all(begin > 0 for begin in begins), "curriculum: a stage at 0 is the task itself; change that")
+
+    @property
+    def in_shares(self) -> bool:
+        """Whether any schedule is in shares of the plan."""
+        return any(in_shares(begins) for begins in (*self.algo.schedules.values(), self.curriculum))
 
 
 def load_train_config(overrides: list[str] | None = None) -> TrainConfig:

@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from pace.config.renamed import current_override
+from pace.config.schedules import Stage
+from pace.config.training import TrainConfig
 from pace.evaluation.quality_report import more_tables
 from pace.evaluation.text import markdown_table
 from pace.rl.policies import saved_config
@@ -40,7 +42,7 @@ def _facts(folder: Path, versions: Mapping[str, Any]) -> str:
     named = [(group, getattr(config, group).name) for group in GROUPS]
     rows = [
         ("task, at the end", ", ".join(f"`{group}={name}`" for group, name in named)),
-        ("curriculum", ", ".join(f"{stage.samples / 1e6:g} M: {' '.join(stage.task)}" for stage in config.curriculum)),
+        ("curriculum", _curriculum(config)),
         ("seed", str(config.seed)),
         ("control steps", f"{counters['samples'] / 1e6:.1f} million"),
         ("time", f"{counters['wall_s'] / 3600:.1f} h, {config.num_worlds:,} worlds"),
@@ -48,6 +50,15 @@ def _facts(folder: Path, versions: Mapping[str, Any]) -> str:
         ("versions", ", ".join(f"{name} {number}" for name, number in versions.get("packages", {}).items() if number)),
     ]
     return markdown_table(("", ""), [row for row in rows if row[1]]).replace("---:", "---")
+
+
+def _curriculum(config: TrainConfig) -> str:
+    """Where each stage begins, and its changes."""
+
+    def begin(stage: Stage) -> str:
+        return f"{stage.place / 1e6:g} M" if stage.share is None else f"{100 * stage.share:g} %"
+
+    return ", ".join(f"{begin(stage)}: {' '.join(stage.task)}" for stage in config.curriculum)
 
 
 def _evaluation(folder: Path, found: Mapping[str, Any]) -> str:

@@ -18,24 +18,12 @@ from torch import Tensor, nn
 from torchrl.modules import IndependentNormal
 
 from pace.config.base import ConfigError
-from pace.config.training import AlgoConfig, SchedulePoint
+from pace.config.training import AlgoConfig
 from pace.devices import has_bf16
 from pace.distributed import ProcessGroup
 
 SMALLEST_STD = 1e-4  # the scale module's own lower bound
 VARIANCE_FLOOR = 1e-4  # the divisor is at least 0.01, so that nearly constant observations stay small
-
-
-def scheduled(points: Sequence[SchedulePoint], samples: float) -> float:
-    """Value of a schedule after ``samples`` control steps: linear between points, constant outside them."""
-    ordered = sorted(points, key=lambda point: point.samples)
-    if samples <= ordered[0].samples:
-        return ordered[0].value
-    for low, high in pairwise(ordered):
-        if samples < high.samples:
-            share = (samples - low.samples) / (high.samples - low.samples)
-            return low.value + share * (high.value - low.value)
-    return ordered[-1].value
 
 
 def compute_dtype(autocast: str, device: torch.device) -> torch.dtype:

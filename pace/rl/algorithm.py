@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from pace.config import plugins
+from pace.config.schedules import Position
 from pace.config.training import AlgoConfig
 from pace.distributed import ProcessGroup
 from pace.rl.agent import Sizes
@@ -32,8 +33,8 @@ class Algorithm(Protocol):
         """All trained networks: its ``state_dict`` is the part "agent" of a checkpoint."""
         ...
 
-    def prepare(self, env: VectorTask, samples: float) -> int:
-        """Allocate storage for these worlds, ``samples`` control steps into the run.
+    def prepare(self, env: VectorTask, at: Position) -> int:
+        """Allocate storage for these worlds, ``at`` a place in the run.
 
         Returns the number of control steps of the next rollout. The worlds may differ from those of the last call.
         """
@@ -55,7 +56,7 @@ class Algorithm(Protocol):
         """A fault of the rollout, such as a value that is not finite, or None. May wait for the device."""
         ...
 
-    def update(self, samples: float) -> Mapping[str, float | Tensor]:
+    def update(self, at: Position) -> Mapping[str, float | Tensor]:
         """Learn from the rollout; returns columns of the run's metrics, the same at each update: numbers, or tensors ()
         on the device, which the trainer reads together.
 

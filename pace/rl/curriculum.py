@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Generic, TypeVar
 
 from pace.config.overrides import stage_tasks
+from pace.config.schedules import Position
 from pace.config.training import TrainConfig
 
 Worlds = TypeVar("Worlds")
@@ -17,25 +18,25 @@ class Curriculum(Generic[Worlds]):
     Args:
         config: of the run; its task is the first stage, ``config.curriculum`` has the others.
         make: worlds of a task, given its configuration and the number of the stage, 0 for the first.
-        samples: control steps of the run so far; :attr:`worlds` are made for the stage that they are in.
+        at: where the run is; :attr:`worlds` are made for the stage of that place.
 
     Attributes: ``tasks`` the configuration of each stage; ``stage`` the current one, ``worlds`` those made for it.
     Errors: :class:`ConfigError`, which names the stage, for changes of unknown keys.
     """
 
-    def __init__(self, config: TrainConfig, make: Callable[[TrainConfig, int], Worlds], samples: float) -> None:
+    def __init__(self, config: TrainConfig, make: Callable[[TrainConfig, int], Worlds], at: Position) -> None:
         self.tasks = stage_tasks(config)
-        self._begins = [0.0, *(stage.samples for stage in config.curriculum)]
+        self._later = config.curriculum
         self._make = make
-        self.stage = self._due(samples)
+        self.stage = self._due(at)
         self.worlds = make(self.tasks[self.stage], self.stage)
 
-    def _due(self, samples: float) -> int:
-        return sum(begin <= samples for begin in self._begins) - 1
+    def _due(self, at: Position) -> int:
+        return sum(stage.reached(at) for stage in self._later)
 
-    def move_on(self, samples: float) -> bool:
-        """Make new worlds if another stage has begun by ``samples`` control steps; returns whether it has."""
-        due = self._due(samples)
+    def move_on(self, at: Position) -> bool:
+        """Make new worlds if another stage has begun ``at`` this place; returns whether it has."""
+        due = self._due(at)
         if due == self.stage:
             return False
         self.stage = due

@@ -14,6 +14,7 @@ from torch import Tensor
 from pace.config.base import ConfigError, config_dir, meant, parse
 from pace.config.overrides import override_task, stage_tasks, without_reward
 from pace.config.predictor import PredictorConfig
+from pace.config.schedules import position_of
 from pace.config.training import TrainConfig
 from pace.devices import resolve_device
 from pace.predictor.network import BallPredictor, make_predictor
@@ -153,7 +154,7 @@ def saved_config(checkpoint: Checkpoint) -> TrainConfig:
     """
     try:
         config = parse(checkpoint.config, TrainConfig)
-        return stage_tasks(config, checkpoint.counters.get("samples", 0.0))[-1]
+        return stage_tasks(config, position_of(checkpoint.counters))[-1]
     except (ConfigError, ValueError) as error:
         raise CheckpointError(f"{checkpoint.path} is of another version of pace: {error}") from error
 

@@ -17,10 +17,11 @@ from pace.arrays.gradients import Gradients
 from pace.arrays.graph import CapturedCall, Graphs
 from pace.arrays.launch import Bound
 from pace.arrays.state import under_prefix
+from pace.config.schedules import START, Position, scheduled
 from pace.config.training import AlgoConfig
 from pace.distributed import ProcessGroup
 from pace.rl.adaptive_rate import KLAdaptiveRate
-from pace.rl.agent import Agent, Policy, RunningNorm, Sizes, scheduled
+from pace.rl.agent import Agent, Policy, RunningNorm, Sizes
 from pace.rl.loss import PPOLoss
 from pace.rl.minibatch import gather, minibatch_of
 from pace.rl.rollout import Rollout, VectorTask, require_finite
@@ -61,22 +62,22 @@ class PPO:
         self._mean = torch.zeros_like(self._metrics)  # of an update
         self._minibatch = Bound(self._make_minibatch, rollout=None)
 
-    def update(self, rollout: Rollout, samples: float) -> dict[str, float]:
+    def update(self, rollout: Rollout, at: Position) -> dict[str, float]:
         """:meth:`learn`, and read the metrics.
 
         Errors: :class:`RolloutError` if one of them is not finite; the weights must then not be saved.
         """
-        metrics = read(self.learn(rollout, samples))
+        metrics = read(self.learn(rollout, at))
         require_finite(metrics)
         return metrics
 
-    def learn(self, rollout: Rollout, samples: float) -> dict[str, Tensor]:
-        """Learn from one rollout, ``samples`` control steps into the run, without a wait for the device.
+    def learn(self, rollout: Rollout, at: Position) -> dict[str, Tensor]:
+        """Learn from one rollout, ``at`` a place in the run, without a wait for the device.
 
         Returns the means of the update's metrics, (). Unless all are finite, the weights must not be saved.
         """
-        self.loss.get_buffer("entropy_coeff").fill_(scheduled(self.config.entropy, samples))
-        self.schedule.target.fill_(scheduled(self.config.kl_target, samples))
+        self.loss.get_buffer("entropy_coeff").fill_(scheduled(self.config.entropy, at))
+        self.schedule.target.fill_(scheduled(self.config.kl_target, at))
         sources = self._sources(rollout)
         batch, step = self._minibatch(rollout)
         rows, count = batch.batch_size[0], self.config.minibatches
@@ -86,7 +87,7 @@ class PPO:
             for index in order[: rows * count].split(rows):
                 gather(sources, index, batch)
                 step()
-        self.agent.actor.bound_std(self.config.std_floor, scheduled(self.config.std, samples))
+        self.agent.actor.bound_std(self.config.std_floor, scheduled(self.config.std, at))
         self._mean.div_(self.config.epochs * count)
         self.group.all_reduce_mean_([self._mean])
         metrics = dict(zip(METRICS, self._mean.unbind(), strict=True))
@@ -207,9 +208,9 @@ class AsymmetricPPO:
         self.ppo = PPO(self.agent, config, group)
         self._finish = Bound(self._make_finish, rollout=None)
 
-    def prepare(self, env: VectorTask, samples: float) -> int:
+    def prepare(self, env: VectorTask, at: Position) -> int:
         """Allocate storage for these worlds in the networks' number format, and apply ``algo.later_steps``."""
-        steps, old = self.config.steps_at(samples), self.rollout
+        steps, old = self.config.steps_at(at), self.rollout
         fits = old is not None and old.env is env and old.steps == steps
         if old is None or not fits or old.policy.dtype != self.agent.observation_dtype:
             self.rollout = Rollout(env, self.agent, steps)
@@ -245,11 +246,11 @@ class AsymmetricPPO:
         """See :meth:`Rollout.fault`."""
         return self.storage().fault()
 
-    def update(self, samples: float) -> dict[str, Tensor]:
+    def update(self, at: Position) -> dict[str, Tensor]:
         """One set of normalisers for all processes, then :meth:`PPO.learn`."""
         for norm, moments in zip(self._norms(), self._moments, strict=True):
             norm.pool(moments, self.group)
-        return self.ppo.learn(self.storage(), samples)
+        return self.ppo.learn(self.storage(), at)
 
     def learned(self, metrics: Mapping[str, float]) -> None:
         """Choose the networks' number format by the policy's standard deviation."""
@@ -261,7 +262,7 @@ class AsymmetricPPO:
     def weights_loaded(self, new_run: bool) -> None:
         """A new run begins with the standard deviation of its configuration."""
         if new_run:
-            self.agent.actor.bound_std(self.config.std_floor, self.config.std[0].value)
+            self.agent.actor.bound_std(self.config.std_floor, scheduled(self.config.std, START))
         self.agent.choose_dtype(self.agent.actor.std.mean().item())
 
     def describe(self) -> str:

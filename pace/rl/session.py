@@ -19,13 +19,16 @@ from pace.arrays.graph import Graphs, graphs_of
 from pace.config import automatic
 from pace.config.base import ConfigError, parse, to_dict
 from pace.config.predictor import PredictorPriors
+from pace.config.schedules import START, position_of
 from pace.config.training import RESUME_KEYS, TrainConfig
 from pace.cores import threads_of
 from pace.devices import has_bf16, machine_of, resolve_device
-from pace.distributed import ProcessGroup, launched_size, own_device, process_group, suitable_size
+from pace.distributed import ProcessGroup, is_first_here, launched_size, own_device, process_group, suitable_size
 from pace.predictor.network import BallPredictor, make_predictor
 from pace.predictor.priors import resolve_priors
 from pace.rl.curriculum import Curriculum
+from pace.rl.kernels import warm
+from pace.rl.plan import in_millions
 from pace.rl.policies import locate
 from pace.rl.trainer import Summary, Trainer, device_type_of, restarts_worlds
 from pace.runs.checkpoint import FOLDER, NAME, Checkpoint, CheckpointError, load_checkpoint
@@ -55,6 +58,8 @@ def train_from_config(composed: DictConfig) -> None:
     else:
         chosen = adapt(config, saved, device, overrides)
     config.processes = config.processes or suitable_size(config.num_worlds, device)
+    if is_first_here():
+        warm(config, device)  # before any clock runs, and once for all processes of this machine
     arguments = overrides if hydra.mode == RunMode.MULTIRUN else None  # of this job; the command's are of all
     with process_group(config.processes, device, arguments) as group:
         trainer = build_trainer(config, saved, device, group)
@@ -145,7 +150,7 @@ def _build(
     new_worlds = saved is not None and restarts_worlds(saved, group, device)
     offset = int(saved.counters["updates"]) if saved and new_worlds else 0  # else the samples of update 0 would repeat
     make = partial(make_worlds, device=device, group=group, predictor=predictor, seed_offset=offset)
-    curriculum = Curriculum(config, make, saved.counters["samples"] if saved else 0.0)
+    curriculum = Curriculum(config, make, position_of(saved.counters) if saved else START)
     trainer = Trainer(config, curriculum.worlds, predictor, run, group, curriculum)
     torch.manual_seed(group.seed(config.seed + offset))  # the networks are equal on all ranks, the rollouts are not
     if saved:
@@ -211,6 +216,8 @@ def announce(trainer: Trainer, run: RunFolder, saved: Checkpoint | None, chosen:
     if saved is not None:
         new_worlds = ", with new worlds" if restarts_worlds(saved, trainer.group, trainer.device) else ""
         print(f"resuming from {saved.path}{new_worlds}")
+    if trainer.plan.samples is not None:
+        print(f"planned: {in_millions(trainer.plan.samples)}")
     shared = f" in {trainer.group.size} processes" if trainer.group.size > 1 else ""
     print(
         f"training {trainer.config.name}: {trainer.config.num_worlds} worlds on {trainer.device}{shared}, "

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from pace.config.base import ConfigError, to_dict
+from pace.config.schedules import PLANNED
 from pace.config.training import TrainConfig
 from pace.distributed import ProcessGroup
 from pace.predictor.network import BallPredictor
@@ -18,6 +19,7 @@ from pace.predictor.regression import PredictorTrainer
 from pace.rl.agent import Sizes
 from pace.rl.algorithm import ALGORITHMS
 from pace.rl.curriculum import Curriculum
+from pace.rl.plan import Plan
 from pace.rl.rollout import RolloutError, TrainableTask
 from pace.rl.update import Update
 from pace.runs.checkpoint import (
@@ -84,6 +86,7 @@ class Trainer:
         networks = [module for _, module in self._networks()]
         self._update = Update(self.algorithm, self.regression, networks, config.robot.control_dt, group)
         self.updates, self.samples, self.wall_s = 0, 0, 0.0
+        self.plan = Plan(config)
         self._stop = StopRequest()
         self._saved_at = time.monotonic()
 
@@ -115,6 +118,7 @@ class Trainer:
                     progress.show(row)
                     if self.run is not None:
                         self.run.log(row)
+                    self._measure(now - started, progress)
                     reason, due = self.group.broadcast_object((self._reason_to_end(now - started), self._save_is_due()))
                     if due or reason is not None:
                         self.save()
@@ -143,7 +147,8 @@ class Trainer:
         return (("agent", self.algorithm.agent), ("predictor", self.predictor))
 
     def _counters(self) -> dict[str, float]:
-        return {"updates": self.updates, "samples": self.samples, "wall_s": self.wall_s}
+        counted = {"updates": self.updates, "samples": self.samples, "wall_s": self.wall_s}
+        return counted if self.plan.samples is None else counted | {PLANNED: self.plan.samples}
 
     @property
     def agent(self) -> nn.Module:
@@ -156,7 +161,7 @@ class Trainer:
 
     def _move_on(self) -> None:
         """Take the next stage's worlds if it begins; called after an update, so that a checkpoint holds them."""
-        if self.curriculum is not None and self.curriculum.move_on(self.samples):
+        if self.curriculum is not None and self.curriculum.move_on(self.plan.position(self.samples)):
             self.env.warn_of_overflow()
             self.env = self.curriculum.worlds
 
@@ -165,13 +170,22 @@ class Trainer:
 
         Errors: see :class:`pace.rl.update.Update`.
         """
-        metrics = self._update(self.env, self.samples)
+        metrics = self._update(self.env, self.plan.position(self.samples))
         self.samples += self._samples_per_update
         self.updates += 1
         if self.config.curriculum and self.curriculum is not None:
             metrics["stage"] = float(self.curriculum.stage)
         self._move_on()
         return {"update": self.updates, "samples": self.samples, **metrics}
+
+    def _measure(self, seconds: float, progress: Progress) -> None:
+        """Fix the plan on all ranks once rank 0 has measured its speed."""
+        if not self.plan.open:
+            return
+        found = self.plan.measure(self.samples, seconds) if self.group.is_rank_0 else None
+        self.plan.samples, said = self.group.broadcast_object(found or (None, ""))
+        if said and self.group.is_rank_0:
+            progress.say(said)
 
     def _reason_to_end(self, seconds: float) -> str | None:
         if self._stop.name is not None:
@@ -253,6 +267,7 @@ class Trainer:
             raise CheckpointError(f"{checkpoint.path} does not fit this configuration: {error}") from error
         self.updates, self.samples = int(checkpoint.counters["updates"]), int(checkpoint.counters["samples"])
         self.wall_s = float(checkpoint.counters["wall_s"])
+        self.plan.samples = checkpoint.counters.get(PLANNED, self.plan.samples)
 
     def _resume_worlds(self, own: dict[str, Any]) -> None:
         """Load this process's worlds and random number generators, as :meth:`checkpoint` saved them."""

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from pace.arrays.graph import CapturedCall, Graphs
 from pace.arrays.launch import Bound
+from pace.config.schedules import Position
 from pace.distributed import ProcessGroup
 from pace.predictor.regression import PredictorTrainer
 from pace.rl.algorithm import Algorithm, InPlace
@@ -43,15 +44,15 @@ class Update:
         self._control_dt = control_dt
         self._roll_out = Bound(self._make_roll_out, env=None, storage=None, samples=None)
 
-    def __call__(self, env: TrainableTask, samples: float) -> dict[str, float]:
-        """One update in the worlds of ``env``, ``samples`` control steps into the run; returns its metrics.
+    def __call__(self, env: TrainableTask, at: Position) -> dict[str, float]:
+        """One update in the worlds of ``env``, ``at`` a place in the run; returns its metrics.
 
         Errors: :class:`RolloutError`, on every rank, if one of them has a fault. The weights must then not be saved.
         """
-        self._play(env, samples)
+        self._play(env, at)
         if self._in_place is None:
             self._require_no_fault()
-        prediction, learning = self.regression.learn(), self.algorithm.update(samples)
+        prediction, learning = self.regression.learn(), self.algorithm.update(at)
         counted = env.pop_statistics()
         sums = torch.stack([value.float() for value in (~self._healthy(), *counted.values())])
         unhealthy, *sums = self.group.all_reduce_sum_(sums).unbind()
@@ -62,9 +63,9 @@ class Update:
             self._in_place.learned(row)
         return task | row
 
-    def _play(self, env: TrainableTask, samples: float) -> None:
+    def _play(self, env: TrainableTask, at: Position) -> None:
         """One rollout, recorded for the predictor."""
-        steps = self.algorithm.prepare(env, samples)
+        steps = self.algorithm.prepare(env, at)
         if steps != self.regression.steps:
             self.regression.resize(steps)
         self.algorithm.begin()

@@ -75,6 +75,13 @@ class Progress:
             self._last_line = time.monotonic()
             print(f"{100 * fraction:3.0f} % | {text}", flush=True)
 
+    def say(self, text: str) -> None:
+        """A line of its own, above the bar if there is one."""
+        if self._bar is not None:
+            self._bar.write(text)
+        else:
+            print(text, flush=True)
+
     def _remaining(self, samples: float) -> tuple[float, float]:
         """Share of the run that is done, and seconds that are left, by whichever limit comes first."""
         elapsed = time.monotonic() - self.started

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from pace.config.base import ConfigError
-from pace.config.training import SchedulePoint
+from pace.config.schedules import Position, SchedulePoint, scheduled
 from pace.distributed import ProcessGroup
-from pace.rl.agent import Agent, Policy, RunningNorm, compute_dtype, scheduled
+from pace.rl.agent import Agent, Policy, RunningNorm, compute_dtype
 from tests.helpers.algo import CPU, small_algo
 
 
@@ -69,9 +69,9 @@ def test_running_norm_goes_on_the_same_after_loading() -> None:
 
 def test_schedule_is_linear_between_points_and_constant_outside() -> None:
     points = [SchedulePoint(0, 0.8), SchedulePoint(10, 0.4), SchedulePoint(20, 0.2)]
-    values = [scheduled(points, samples) for samples in (-1, 0, 5, 10, 15, 20, 99)]
+    values = [scheduled(points, Position(samples)) for samples in (-1, 0, 5, 10, 15, 20, 99)]
     assert values == pytest.approx([0.8, 0.8, 0.6, 0.4, 0.3, 0.2, 0.2])
-    assert scheduled(points[:1], 7) == 0.8
+    assert scheduled(points[:1], Position(7)) == 0.8
 
 
 def test_std_starts_at_the_first_point_and_stays_within_its_bounds() -> None:

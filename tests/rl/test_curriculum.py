@@ -11,19 +11,21 @@ import torch
 
 from pace.config.base import ConfigError
 from pace.config.overrides import stage_tasks
-from pace.config.training import Stage, TrainConfig, load_train_config
+from pace.config.schedules import START, Position, Stage
+from pace.config.training import TrainConfig, load_train_config
 from pace.rl.curriculum import Curriculum
 from pace.rl.policies import load_policy
 from pace.rl.train import main
 from pace.runs.checkpoint import load_checkpoint
 from pace.runs.metrics import read_metrics
+from tests.helpers.algo import IN_SAMPLES
 from tests.helpers.fakes import config
 
 WORLDS, STEPS = 8, 6
 UPDATE = WORLDS * STEPS
 SMALL = [
     f"num_worlds={WORLDS}", f"algo.steps={STEPS}", "algo.actor_hidden=[16]", "algo.critic_hidden=[16]",
-    "progress=false", "tensorboard=false", "processes=1", "engine.threads=1",
+    "progress=false", "tensorboard=false", "processes=1", "engine.threads=1", *IN_SAMPLES,
 ]  # fmt: skip
 WIDER = f"curriculum=[{{samples: {2 * UPDATE}, task: ['sensing=wide', 'serve.serves_per_episode=9']}}]"
 
@@ -62,13 +64,13 @@ def test_worlds_are_made_when_a_stage_begins() -> None:
         made.append((task.sensing.name, stage))
         return f"worlds {stage}"
 
-    curriculum = Curriculum(staged(), make, 0.0)
-    assert [curriculum.move_on(samples) for samples in (0.0, 0.9e6, 1e6, 2e6, 3.1e6, 9e6)] == [
+    curriculum = Curriculum(staged(), make, START)
+    assert [curriculum.move_on(Position(samples)) for samples in (0.0, 0.9e6, 1e6, 2e6, 3.1e6, 9e6)] == [
         False, False, True, False, True, False
     ]  # fmt: skip
     assert made == [("clean", 0), ("paper", 1), ("paper", 2)]
     assert curriculum.worlds == "worlds 2"
-    assert Curriculum(staged(), make, 1e6).worlds == "worlds 1"  # a run that goes on there
+    assert Curriculum(staged(), make, Position(1e6)).worlds == "worlds 1"  # a run that goes on there
 
 
 def train(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:

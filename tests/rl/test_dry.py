@@ -16,7 +16,8 @@ from torchrl.objectives import ClipPPOLoss
 
 from pace.arrays.graph import Graphs
 from pace.arrays.watch import DryRunError
-from pace.config.training import SchedulePoint, TrainConfig, load_train_config
+from pace.config.schedules import START, SchedulePoint
+from pace.config.training import TrainConfig, load_train_config
 from pace.distributed import ProcessGroup
 from pace.predictor.network import PredictorNetwork
 from pace.predictor.regression import PredictorTrainer
@@ -28,6 +29,7 @@ from pace.rl.train import main
 from pace.rl.trainer import Trainer
 from pace.runs.checkpoint import Checkpoint, flatten_tensors, load_checkpoint
 from pace.runs.metrics import read_metrics
+from tests.helpers.algo import IN_SAMPLES
 from tests.helpers.dummy import DummyTask
 from tests.helpers.emulation import without_replay
 
@@ -130,7 +132,7 @@ def test_a_rollout_in_the_place_of_another_has_its_own_graphs() -> None:
             for name in ("policy", "critic", "action", "advantage", "value_target"):
                 getattr(rollout, name).normal_()
             for _ in range(2):
-                learner.update(rollout, 0.0)
+                learner.update(rollout, START)
             del rollout
         ends.append({name: value.clone() for name, value in trainer.agent.state_dict().items()})
     assert differing(*ends) == []
@@ -243,6 +245,7 @@ def test_a_learning_rate_that_is_lost_in_a_resume_is_seen(monkeypatch: pytest.Mo
 TRAINED = (
     "device=cpu", "engine.graph=dry", "num_worlds=32", "minutes=0", "progress=false", "tensorboard=false",
     "algo.actor_hidden=[32]", "algo.critic_hidden=[32]", "predictor.batches_per_update=8",
+    *IN_SAMPLES,
 )  # fmt: skip
 CHANGES = (  # 128 control steps an update, 192 later
     "algo.std=[{samples: 256, value: 0.5},{samples: 384, value: 0.2}]", "algo.later_steps=[{samples: 1024, value: 6}]",

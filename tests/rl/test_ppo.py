@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from pace.config.base import ConfigError
-from pace.config.training import AlgoConfig, SchedulePoint
+from pace.config.schedules import START, Position, SchedulePoint
+from pace.config.training import AlgoConfig
 from pace.rl.agent import Agent
 from pace.rl.ppo import PPO
 from pace.rl.rollout import Rollout, RolloutError
@@ -33,7 +34,7 @@ def test_first_step_is_that_of_a_plain_ppo() -> None:
     config = small_algo(epochs=1, minibatches=1, learning_rate_min=1e-3, learning_rate_max=1e-3)
     agent, rollout = played(config)
     plain = copy.deepcopy(agent)
-    metrics = PPO(agent, config).update(rollout, 0)
+    metrics = PPO(agent, config).update(rollout, START)
 
     advantage = rollout.advantage.flatten()
     advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
@@ -70,7 +71,7 @@ def test_kl_metric_is_the_divergence_of_the_two_gaussians() -> None:
     new = torch.distributions.Normal(agent.actor.mlp(rollout.policy).detach(), agent.actor.std)
     old = torch.distributions.Normal(rollout.loc, rollout.scale)
     expected = torch.distributions.kl_divergence(old, new).sum(-1).mean().item()
-    assert ppo.update(rollout, 0)["kl"] == pytest.approx(expected, rel=1e-4)
+    assert ppo.update(rollout, START)["kl"] == pytest.approx(expected, rel=1e-4)
 
 
 @pytest.mark.parametrize("autocast", ["fp32", "bf16"])
@@ -79,9 +80,9 @@ def test_updates_change_every_parameter_and_lower_the_critic_loss(autocast: str)
     agent, rollout = played(config)
     before = {name: p.detach().clone() for name, p in agent.named_parameters()}
     ppo = PPO(agent, config)
-    first = ppo.update(rollout, 0)
+    first = ppo.update(rollout, START)
     for _ in range(10):
-        last = ppo.update(rollout, 0)
+        last = ppo.update(rollout, START)
     assert all(not torch.equal(before[name], p) for name, p in agent.named_parameters())
     assert last["loss_critic"] < 0.7 * first["loss_critic"]
 
@@ -91,7 +92,7 @@ def test_learning_rate_falls_when_the_policy_moves_too_far() -> None:
     agent, rollout = played(config)
     ppo = PPO(agent, config)
     for _ in range(3):
-        metrics = ppo.update(rollout, 0)
+        metrics = ppo.update(rollout, START)
     assert config.learning_rate_min <= metrics["lr"] < config.learning_rate
     assert ppo.critic_optimiser.param_groups[0]["lr"] == config.learning_rate
 
@@ -102,7 +103,7 @@ def test_schedules_follow_the_samples() -> None:
     config = small_algo(std=std, entropy=entropy, std_floor=0.0)
     agent, rollout = played(config)
     ppo = PPO(agent, config)
-    metrics = ppo.update(rollout, 50)
+    metrics = ppo.update(rollout, Position(50))
     assert metrics["policy_std"] <= 0.4 + 1e-6
     assert ppo.loss.get_buffer("entropy_coeff").item() == pytest.approx(0.005)
 
@@ -111,7 +112,7 @@ def test_more_minibatches_than_samples_are_refused() -> None:
     config = small_algo(minibatches=100)
     agent, rollout = played(config, worlds=4, steps=4)
     with pytest.raises(ConfigError, match=r"algo\.minibatches 100"):
-        PPO(agent, config).update(rollout, 0)
+        PPO(agent, config).update(rollout, START)
 
 
 def test_a_loss_that_is_not_finite_is_an_error() -> None:
@@ -119,20 +120,20 @@ def test_a_loss_that_is_not_finite_is_an_error() -> None:
     agent, rollout = played(config)
     rollout.value_target[0, 0] = math.nan
     with pytest.raises(RolloutError, match=r"loss_critic|grad_norm_critic"):
-        PPO(agent, config).update(rollout, 0)
+        PPO(agent, config).update(rollout, START)
 
 
 def test_state_restores_the_optimisers() -> None:
     config = small_algo()
     agent, rollout = played(config)
     ppo = PPO(agent, config)
-    ppo.update(rollout, 0)
+    ppo.update(rollout, START)
     twin_agent = copy.deepcopy(agent)
     twin = PPO(twin_agent, config)
     twin.load_state_dict(copy.deepcopy(ppo.state_dict()))
     for learner in (ppo, twin):
         torch.manual_seed(11)
-        learner.update(rollout, 0)
+        learner.update(rollout, START)
     for mine, theirs in zip(agent.parameters(), twin_agent.parameters(), strict=True):
         assert torch.equal(mine, theirs)
 
@@ -146,5 +147,5 @@ def test_at_a_small_spread_the_kl_of_bf16_networks_is_rounding() -> None:
             learning_rate_max=1e-8, last_layer_gain=1.0, actor_hidden=[256, 128],
         )  # fmt: skip
         agent, rollout = played(config)
-        kl[autocast] = PPO(agent, config).update(rollout, 0)["kl"]
+        kl[autocast] = PPO(agent, config).update(rollout, START)["kl"]
     assert 0 < kl["fp32"] < 0.1 * kl["bf16"]

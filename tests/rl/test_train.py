@@ -16,6 +16,7 @@ from pace.rl.train import main
 from pace.rl.trainer import Trainer
 from pace.runs.checkpoint import load_checkpoint
 from pace.runs.metrics import read_metrics
+from tests.helpers.algo import IN_SAMPLES
 
 WORLDS = 8
 UPDATE = WORLDS * 12
@@ -25,6 +26,7 @@ SMALL = (
     "algo.critic_hidden=[32]",
     "predictor.batches_per_update=2",
     "progress=false",
+    *IN_SAMPLES,
 )
 
 

@@ -14,7 +14,8 @@ import torch
 from omegaconf import OmegaConf
 
 from pace.config.base import ConfigError, parse, to_dict
-from pace.config.training import SchedulePoint, TrainConfig, load_train_config
+from pace.config.schedules import SchedulePoint
+from pace.config.training import TrainConfig, load_train_config
 from pace.predictor.network import PredictorNetwork
 from pace.rl.ppo import AsymmetricPPO
 from pace.rl.rates import rates
@@ -23,6 +24,7 @@ from pace.rl.trainer import Trainer
 from pace.runs.checkpoint import CheckpointError, list_checkpoints, load_checkpoint
 from pace.runs.metrics import read_metrics
 from pace.runs.run_folder import RunFolder
+from tests.helpers.algo import IN_SAMPLES
 from tests.helpers.dummy import DummyTask
 
 WORLDS = 64
@@ -41,6 +43,7 @@ def make_config(updates: int = 2, **changes: object) -> TrainConfig:
             "predictor.batches_per_update=4",
             "tensorboard=false",
             "progress=false",
+            *IN_SAMPLES,
         ]
     )
     for name, value in changes.items():

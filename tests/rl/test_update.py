@@ -11,7 +11,8 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from pace.config.base import to_dict
-from pace.config.training import AlgoConfig, SchedulePoint, TrainConfig, load_train_config
+from pace.config.schedules import SchedulePoint
+from pace.config.training import AlgoConfig, TrainConfig, load_train_config
 from pace.predictor.network import PredictorNetwork
 from pace.rl.ppo import AsymmetricPPO
 from pace.rl.rollout import RolloutError

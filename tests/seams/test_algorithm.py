@@ -38,7 +38,7 @@ REINFORCE = """
             self.std = config.params.get("std", 0.3)
             self.optimiser = torch.optim.Adam(self.agent.parameters(), lr=config.params.get("rate", 0.01))
 
-        def prepare(self, env, samples):
+        def prepare(self, env, at):
             self.env, steps, worlds = env, self.config.steps, len(env.reward)
             self.seen = torch.zeros(steps, worlds, self.sizes.policy)
             self.action = torch.zeros(steps, worlds, self.sizes.actions)
@@ -66,7 +66,7 @@ REINFORCE = """
         def fault(self):
             return None if bool(self.returns.isfinite().all()) else "a return is not finite"
 
-        def update(self, samples):
+        def update(self, at):
             advantage = self.returns - self.returns.mean()
             miss = (self.action - self.agent(self.seen)).square().sum(2) / (2.0 * self.std**2)
             loss = (miss * advantage / (advantage.std() + 1e-8)).mean()
@@ -92,8 +92,8 @@ CALM = """
     from pace.rl.ppo import AsymmetricPPO
 
     class CalmPPO(AsymmetricPPO):
-        def update(self, samples):
-            metrics = super().update(samples)
+        def update(self, at):
+            metrics = super().update(at)
             self.agent.actor.bound_std(0.0, self.config.params["largest_std"])
             return metrics | {"policy_std": self.agent.actor.std.mean().item()}
 

@@ -28,6 +28,10 @@ def assert_holds(config: Any, wanted: Any) -> None:
         for key, value in wanted.items():
             assert_holds(config[key], value)
         assert "terms" not in wanted or set(config["terms"]) == set(wanted["terms"])
+    elif isinstance(wanted, list):
+        assert len(config) == len(wanted)
+        for value, one in zip(config, wanted, strict=True):
+            assert_holds(value, one)
     else:
         assert config == wanted
 
@@ -51,7 +55,7 @@ def test_a_recipe_is_whole_and_of_this_version(name: str) -> None:
     run_keys = set(plain) - set(written(name))
     assert run_keys == {
         "device", "processes", "seed", "out", "resume", "init_from", "predictor_from", "checkpoint_minutes",
-        "tensorboard", "progress", "plugins",
+        "tensorboard", "progress", "plugins", "plan",
     }  # fmt: skip
     assert set(plain["ball"]) - set(written(name)["ball"]) == {"air"}  # of which these balls use nothing
 
