@@ -192,13 +192,21 @@ class _Workers:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        for process in self._started.values():
+        for rank, process in self._started.items():
             try:
-                process.wait(SECONDS_TO_END if kind is None else 0)
+                status = process.wait(SECONDS_TO_END if kind is None else 0)
             except subprocess.TimeoutExpired:
                 process.kill()
-                process.wait()
+                status = process.wait()
+            if kind is None and status != 0:  # the work is done, and saved
+                print(f"warning: {self._ended(rank, status)}", file=sys.stderr)
         self._open.close()
+
+    def _ended(self, rank: int, status: int) -> str:
+        """How a worker has ended, and the end of its output."""
+        self._logs[rank].seek(0)
+        tail = "\n".join(self._logs[rank].read().splitlines()[-TAIL_LINES:])
+        return f"process {rank} of {len(self._started) + 1} ended with status {status}:\n{tail}"
 
     def wait_for(self, store: dist.Store) -> None:
         """Return when all have connected to ``store``."""
@@ -222,11 +230,9 @@ class _Workers:
         deadline = time.monotonic() + patience
         while True:
             for rank, process in self._started.items():
-                if process.poll() is not None:
-                    self._logs[rank].seek(0)
-                    tail = "\n".join(self._logs[rank].read().splitlines()[-TAIL_LINES:])
-                    status = f"process {rank} of {len(self._started) + 1} ended with status {process.returncode}"
-                    raise ProcessGroupError(f"{status}:\n{tail}") from cause
+                status = process.poll()
+                if status is not None:
+                    raise ProcessGroupError(self._ended(rank, status)) from cause
             if time.monotonic() >= deadline:
                 return
             time.sleep(POLL_SECONDS)
@@ -234,7 +240,9 @@ class _Workers:
 
 def _end_with_rank_0() -> None:
     """In a worker: wait until rank 0 ends, for whatever reason, and end too."""
-    sys.stdin.buffer.read()  # rank 0 writes nothing; its end of the pipe closes when it ends
+    # rank 0 writes nothing; its end of the pipe closes when it ends. Not sys.stdin: at the end of a worker's own work
+    # Python would find the lock of that file taken, and abort
+    os.read(0, 1)
     os._exit(RANK_0_IS_GONE)
 
 

@@ -15,6 +15,7 @@ from pace.evaluation.quality_report import more_tables
 from pace.evaluation.records import COLUMNS, FAILURES, by_ball
 from pace.evaluation.serves import Row
 from pace.evaluation.text import interval, markdown_table, number, text_table
+from pace.runs.files import write_whole
 
 JSON, CSV, MARKDOWN, SERVES = "evaluation.json", "evaluation.csv", "evaluation.md", "serves.csv"
 UNITS = {
@@ -124,7 +125,7 @@ def flat(row: Mapping[str, Any]) -> dict[str, Any]:
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Strict JSON, NaN as null."""
-    path.write_text(json.dumps(clean(content), indent=1, allow_nan=False) + "\n")
+    write_whole(path, json.dumps(clean(content), indent=1, allow_nan=False) + "\n")
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -134,7 +135,7 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     writer = csv.DictWriter(text, list(flattened[0]))
     writer.writeheader()
     writer.writerows(flattened)
-    path.write_text(text.getvalue())
+    write_whole(path, text.getvalue())
 
 
 def write_serves(path: Path, rows: Sequence[Row]) -> None:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pace.distributed import ProcessGroup
 
-COUNTS = ("serves", "hits", "successes", "falls", "episodes", "steps", "reward_sum")
+COUNTS = ("serves", "hits", "successes", "falls", "episodes", "steps", "reward_sum", "diverged")
 
 
 def summarise(statistics: dict[str, Tensor], control_dt: float, group: ProcessGroup | None = None) -> dict[str, float]:
@@ -31,6 +31,7 @@ def summarise(statistics: dict[str, Tensor], control_dt: float, group: ProcessGr
         "mean_reward": share("reward_sum", "steps"),
         "episodes": sums["episodes"],
         "serves": sums["serves"],
+        "diverged": sums.get("diverged", 0.0),
     }
     for name in sums:
         if name.startswith("reward/"):

@@ -110,6 +110,9 @@ def _write(folder: Path, checkpoint: Checkpoint) -> None:
         save_file(training, folder / TRAINING)
     save_file(weights, folder / WEIGHTS)
     (folder / META).write_text(json.dumps(meta, indent=1))
+    readers = (folder / META).stat().st_mode & 0o777  # safetensors closes its files to everybody else
+    for file in folder.iterdir():
+        file.chmod(readers)
     for file in (*folder.iterdir(), folder):
         _sync(file)  # before the rename makes them the newest checkpoint
 

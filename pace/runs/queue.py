@@ -201,7 +201,7 @@ class RunQueue:
         )
 
     def play(self) -> None:
-        """Train the unfinished runs. Errors: ``KeyboardInterrupt`` when stopped by Ctrl-C or SIGTERM.
+        """Train the unfinished runs. Errors: ``KeyboardInterrupt`` when stopped by Ctrl-C, or :class:`Terminated`.
 
         The runs are then saved first; a second Ctrl-C does not wait for that.
         """
@@ -212,6 +212,7 @@ class RunQueue:
                 for job in self._active.values():
                     job.end(kill=True)
                 self._bar.close()
+        self._stop.require_not_terminated()
         if self._stop.name is not None:
             raise KeyboardInterrupt
 

@@ -9,39 +9,20 @@ from __future__ import annotations
 import socket
 import time
 from collections.abc import Callable, Sequence
-from contextlib import redirect_stdout
-from io import StringIO
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import Any
-
-import mujoco
-import numpy as np
 
 from pace.config.base import ConfigError
 from pace.rl.policies import TaskPolicy, load_policy
 from pace.runs.checkpoint import FOLDER, CheckpointError, list_checkpoints
-from pace.sim.render import Colour
-from pace.sim.robot import build_model
-from pace.viewer.playback import (
-    APEX_COLOUR,
-    APEX_RADIUS,
-    BASE_COLOUR,
-    BASE_RADIUS,
-    FLIGHT_COLOUR,
-    FLIGHT_WIDTH,
-    PREDICTION_COLOUR,
-    PREDICTION_RADIUS,
-    Serve,
-    Show,
-    Snapshot,
-)
+from pace.viewer.playback import Serve, Show, Snapshot
+from pace.viewer.scene import BrowserScene, open_server
 
 FRAME = 1.0 / 30.0  # s between pictures
 LONGEST_FRAME = 0.1  # s: a page does not catch up after a longer delay
+SLOWEST = 0.05  # speed of time, unless the user asks for less
 IDLE = 0.1  # s between checks for a connected browser
 LOOK_FOR_CHECKPOINTS = 5.0  # s: a training run may write new ones
-CAMERA, LOOK_AT = (-2.9, -2.6, 1.7), (-0.7, 0.0, 0.8)  # m, the first view
 #: Sliders of a serve: label, least, largest, step, start, hint. In the order of :class:`Serve`.
 SERVE_SLIDERS = (
     ("Speed (m/s)", 4.5, 7.5, 0.05, 5.8, "over the ground"),
@@ -113,65 +94,24 @@ class Page:
     ) -> None:
         require_viewer()
         require_port(host, port)
-        import viser
-
         self._overrides, self._seed = list(overrides), seed
         self._ball: str | None = None  # that of the overrides, or of the saved task
         self._policy = policy
         self._requests: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self.show = Show(policy, overrides, seed)
-        with redirect_stdout(StringIO()):  # hides its banner
-            self.server = viser.ViserServer(host=host, port=port, label="PACE", verbose=False)
+        self.server = open_server(host, port)
         if self.server.get_port() != port:  # another process took it first
             self.server.stop()
             raise PageError(f"port {port} of {host} was taken just now: give another port=")
         self.url = f"http://{host}:{port}"
-        self._build_scene()
+        self._scene = BrowserScene(self.server, self.show.config)
         self._build_controls(balls, speed)
-        self._drawn_flight = 0
         self._next_look = 0.0
-
-    # --- scene --------------------------------------------------------------------------------------------------------
-
-    def _build_scene(self) -> None:
-        from mjviser import ViserMujocoScene
-
-        config = self.show.env.config
-        model = build_model(config.robot, config.engine, config.ball.table, visual=True)
-        self._data = mujoco.MjData(model)
-        self._scene = ViserMujocoScene(self.server, model, num_envs=1)
-        self._scene.camera_tracking_enabled = False  # the marks are in the world's frame
-        self.server.initial_camera.position, self.server.initial_camera.look_at = CAMERA, LOOK_AT
-        self._marks = {
-            "apex": self._mark("apex", APEX_RADIUS, APEX_COLOUR),
-            "prediction": self._mark("prediction", PREDICTION_RADIUS, PREDICTION_COLOUR),
-            "base_target": self._mark("base_target", BASE_RADIUS, BASE_COLOUR),
-        }
-
-    def _mark(self, name: str, radius: float, colour: Colour) -> Any:
-        return self.server.scene.add_icosphere(f"/marks/{name}", radius, _rgb(colour), cast_shadow=False)
 
     def draw(self, snapshot: Snapshot) -> None:
         """Send all changes to the browsers."""
-        self._data.qpos[:] = snapshot.qpos
-        self._data.mocap_pos[0] = snapshot.ball
-        mujoco.mj_kinematics(self._scene.mj_model, self._data)
-        with self.server.atomic():
-            for name, handle in self._marks.items():
-                place = getattr(snapshot, name)
-                handle.visible = place is not None
-                if place is not None:
-                    handle.position = place
-            if snapshot.flight_number != self._drawn_flight:
-                self._drawn_flight = snapshot.flight_number
-                self._draw_flight(snapshot)
-            self._scene.update_from_mjdata(self._data)
-        self._say(self.show.score.text())
-
-    def _draw_flight(self, snapshot: Snapshot) -> None:
-        pieces = np.stack((snapshot.flight[:-1], snapshot.flight[1:]), axis=1)
-        look = {"thickness": FLIGHT_WIDTH, "thickness_units": "screen"}
-        self.server.scene.add_line_segments("/marks/flight", pieces, _rgb(FLIGHT_COLOUR), **look)
+        self._scene.draw(snapshot)
+        self._say(self.show.text())
 
     def _say(self, text: str) -> None:
         if self._score.content != text:
@@ -183,12 +123,13 @@ class Page:
         gui = self.server.gui
         gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
         gui.main_panel.dock_right()
-        self._score = gui.add_markdown(self.show.score.text())
+        self._score = gui.add_markdown(self.show.text())
         next_serve = gui.add_button("Next serve")
         next_serve.on_click(lambda _: self._ask(lambda: self.show.next_serve(self.serve)))
         ball = gui.add_button_group("Ball", tuple(balls))
         ball.on_click(lambda _: self._ask(lambda: self._change_ball(ball.value)))
-        self._time = gui.add_slider("Speed of time", min=0.05, max=1.0, step=0.05, initial_value=speed)
+        least = min(SLOWEST, speed)
+        self._time = gui.add_slider("Speed of time", min=least, max=1.0, step=least, initial_value=speed)
         self._build_serve()
         self._checkpoint = gui.add_dropdown("Checkpoint", self._names(), initial_value=Path(self._policy.source).name)
         self._checkpoint.on_update(lambda _: self._ask(lambda: self._change_checkpoint(self._checkpoint.value)))
@@ -219,7 +160,7 @@ class Page:
         self._requests.put(request)
 
     def _describe(self) -> str:
-        config, policy = self.show.env.config, self._policy
+        config, policy = self.show.config, self._policy
         samples = policy.counters.get("samples", 0.0)
         return f"{Path(policy.source).name}, {samples / 1e6:.1f} M samples; ball {config.ball.name}"
 
@@ -251,7 +192,7 @@ class Page:
             return
         self._policy, self._ball = policy, ball
         self.show.choose(self.serve)
-        self._drawn_flight = 0
+        self._scene.forget_flight()
         self._status.content = self._describe()
 
     def _look_for_checkpoints(self) -> None:
@@ -286,8 +227,3 @@ class Page:
             self.draw(self.show.advance(elapsed * self._time.value))
         else:
             time.sleep(IDLE)
-
-
-def _rgb(colour: Colour) -> tuple[int, int, int]:
-    red, green, blue, _ = (round(255 * part) for part in colour)
-    return red, green, blue

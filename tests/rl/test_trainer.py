@@ -197,7 +197,7 @@ def test_rows_after_the_checkpoint_are_replaced_by_a_resume(tmp_path: Path) -> N
     assert read_metrics(tmp_path / "metrics.csv")["samples"] == [UPDATE, 2 * UPDATE, 3 * UPDATE]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_the_run_with_a_checkpoint(tmp_path: Path, number: signal.Signals) -> None:
     trainer = make_trainer(tmp_path, updates=1000)
     advance = trainer.env.advance
@@ -223,6 +223,7 @@ def test_a_signal_ends_the_run_with_a_checkpoint(tmp_path: Path, number: signal.
 
 def test_a_nan_keeps_the_last_good_checkpoint(tmp_path: Path) -> None:
     trainer = make_trainer(tmp_path, updates=10, checkpoint_minutes=0.0)
+    trainer.config.algo.skips = 0
     trainer.env.poison_step = 30  # type: ignore[attr-defined]
     with pytest.raises(RolloutError, match="column 1 of world 3 "):
         trainer.train()

@@ -283,6 +283,16 @@ def test_controls_of_the_page(policy: TaskPolicy, port: int) -> None:
         shown.server.stop()
 
 
+@pytest.mark.parametrize("speed", [0.04, 0.001, 0.07, 1.0])
+def test_a_page_begins_at_any_speed_of_time(policy: TaskPolicy, port: int, speed: float) -> None:
+    pytest.importorskip("mjviser")
+    from pace.viewer.web import Page
+
+    shown = Page(policy, QUICK, ["paper"], port=port, speed=speed)
+    assert shown._time.value == speed
+    shown.server.stop()
+
+
 def test_the_saved_task_is_played() -> None:
     show = standing(["serve=short", "ball=paper", "serve.serves_per_episode=3"])
     config = show.env.config
