@@ -7,6 +7,7 @@ import os
 import re
 import sys
 from collections.abc import Sequence
+from io import TextIOWrapper
 from pathlib import Path
 from pkgutil import resolve_name
 
@@ -43,6 +44,8 @@ def run_command(name: str) -> int:
     that the user names, in ``plugins`` or by an import path, are imported first (:mod:`pace.config.plugins`). Wrong
     input gives one line and status 2, an expected error one line and 1; a run that SIGTERM has ended gives 75.
     """
+    if isinstance(sys.stdout, TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # names of files in letters that the terminal does not have
     try:
         if {"-h", "--help"} & set(sys.argv[1:]):
             return show(command_help(name, _topic(sys.argv[1:])))

@@ -18,7 +18,8 @@ from pace.config.base import parse
 from pace.config.commands import KeepConfig
 from pace.evaluation.card import CARD, card
 from pace.rl.policies import locate
-from pace.runs.checkpoint import FOLDER, META, WEIGHTS, CheckpointError, export_weights, find_checkpoint
+from pace.runs.checkpoint import META, WEIGHTS, CheckpointError, export_weights, find_checkpoint
+from pace.runs.checkpoint_folders import FOLDER
 from pace.runs.metrics import write_slim
 from pace.runs.run_folder import METRICS
 

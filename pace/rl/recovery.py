@@ -13,7 +13,8 @@ from pace.config.base import to_dict
 from pace.config.training import TrainConfig
 from pace.distributed import ProcessGroup
 from pace.rl.rollout import RolloutError, TrainableTask
-from pace.runs.checkpoint import LAST_GOOD, Checkpoint, CheckpointError, save_checkpoint
+from pace.runs.checkpoint import Checkpoint, CheckpointError, save_checkpoint
+from pace.runs.checkpoint_folders import LAST_GOOD
 from pace.runs.files import say
 from pace.runs.run_folder import RunFolder
 from pace.sim.replay import save_replay

@@ -26,7 +26,8 @@ from pace.predictor.priors import resolve_priors
 from pace.rl.curriculum import Curriculum
 from pace.rl.policies import locate
 from pace.rl.trainer import Summary, Trainer, device_type_of, restarts_worlds
-from pace.runs.checkpoint import FOLDER, NAME, Checkpoint, CheckpointError, load_checkpoint
+from pace.runs.checkpoint import Checkpoint, CheckpointError, load_checkpoint
+from pace.runs.checkpoint_folders import FOLDER, NAME
 from pace.runs.files import tell
 from pace.runs.learning_curve import CURVE
 from pace.runs.progress import rate_texts

@@ -21,11 +21,7 @@ from pace.rl.curriculum import Curriculum
 from pace.rl.rates import summarise
 from pace.rl.recovery import Recovery
 from pace.rl.rollout import RolloutError, TrainableTask
-from pace.runs.checkpoint import (
-    Checkpoint,
-    CheckpointError,
-    load_weights,
-)
+from pace.runs.checkpoint import Checkpoint, CheckpointError, load_weights
 from pace.runs.interrupt import StopRequest
 from pace.runs.learning_curve import plot_learning_curve
 from pace.runs.progress import Progress

@@ -22,7 +22,8 @@ from pace.command import quote
 from pace.config.base import ConfigError, parse, search_override, to_dict
 from pace.config.training import RESUME_KEYS, TrainConfig, load_train_config
 from pace.cores import core_set, usable_cores
-from pace.runs.checkpoint import list_checkpoints, read_meta
+from pace.runs.checkpoint import read_meta
+from pace.runs.checkpoint_folders import list_checkpoints
 from pace.runs.interrupt import StopRequest
 from pace.runs.metrics_file import LEADING
 from pace.runs.progress import SECONDS_PER_LINE, clock

@@ -23,16 +23,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 from pace.config.base import ConfigError
 from pace.config.upgrade import FORMAT
-from pace.runs.checkpoint import (
-    FOLDER,
-    Checkpoint,
-    CheckpointError,
-    clear_leftovers,
-    list_checkpoints,
-    prune_checkpoints,
-    save_checkpoint,
-    update_of,
-)
+from pace.runs.checkpoint import Checkpoint, CheckpointError, save_checkpoint
+from pace.runs.checkpoint_folders import FOLDER, clear_leftovers, list_checkpoints, prune_checkpoints, update_of
 from pace.runs.files import reason, say, write_whole
 from pace.runs.metrics_file import FIRST_COLUMN, EventsFile, MetricsFile
 

@@ -14,7 +14,8 @@ from queue import Empty, SimpleQueue
 
 from pace.config.base import ConfigError
 from pace.rl.policies import TaskPolicy, load_policy
-from pace.runs.checkpoint import FOLDER, CheckpointError, list_checkpoints
+from pace.runs.checkpoint import CheckpointError
+from pace.runs.checkpoint_folders import FOLDER, list_checkpoints
 from pace.viewer.playback import Serve, Show, Snapshot
 from pace.viewer.scene import BrowserScene, open_server
 

@@ -73,6 +73,6 @@ def assert_same(one: object, other: object, place: str = "") -> None:
         for index, (a, b) in enumerate(zip(one, other, strict=True)):
             assert_same(a, b, f"{place}[{index}]")
     elif isinstance(one, torch.Tensor) and isinstance(other, torch.Tensor):
-        assert torch.equal(one, other), place
+        torch.testing.assert_close(one, other, rtol=0.0, atol=0.0, equal_nan=True, msg=place)
     else:
         assert one == other, place

@@ -19,7 +19,8 @@ import torch
 
 from pace.config.base import ConfigError
 from pace.rl.train import main
-from pace.runs.checkpoint import FOLDER, CheckpointError, find_checkpoint, list_checkpoints, load_checkpoint
+from pace.runs.checkpoint import CheckpointError, find_checkpoint, load_checkpoint
+from pace.runs.checkpoint_folders import FOLDER, list_checkpoints
 from pace.runs.run_folder import RunFolder
 from tests.helpers.outside import SMALL, command
 from tests.helpers.training import assert_same_run, dummy_trainer, rows_of
@@ -247,12 +248,12 @@ def test_real_runs_killed_at_random_moments_resume_bit_for_bit(tmp_path: Path, p
     assert first.wait(900) == 0
     kills = 0
     while kills < 20:
-        resume = bool(list_checkpoints(broken))
-        began = len(rows_of(broken)) if resume else 0
-        arguments = (f"resume={broken}",) if resume else (*TINY, f"processes={processes}", f"out={broken}")
+        began = list_checkpoints(broken)
+        arguments = (f"resume={broken}",) if began else (*TINY, f"processes={processes}", f"out={broken}")
         process = start(*arguments, *limits, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         if generator.random() < 0.8:  # else it may end before its first update
-            wait_for_rows(broken, process, min(began + 1, updates - 1))
+            while process.poll() is None and list_checkpoints(broken) == began:
+                time.sleep(0.005)
         deadline = time.monotonic() + generator.uniform(0.0, 1.0)
         during_a_save = kills % 3 == 0
         while process.poll() is None and time.monotonic() < deadline and not (during_a_save and is_saving(broken)):

@@ -12,7 +12,8 @@ from torch import Tensor, nn
 from pace.rl.recovery import LastGood
 from pace.rl.rollout import RolloutError
 from pace.rl.trainer import Trainer
-from pace.runs.checkpoint import CheckpointError, list_checkpoints, load_checkpoint
+from pace.runs.checkpoint import CheckpointError, load_checkpoint
+from pace.runs.checkpoint_folders import list_checkpoints
 from pace.runs.optimiser import load_optimiser_state, optimiser_state
 from tests.helpers.training import UPDATE, assert_same, dummy_trainer, rows_of
 

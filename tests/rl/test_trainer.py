@@ -20,7 +20,8 @@ from pace.rl.ppo import AsymmetricPPO
 from pace.rl.rates import summarise
 from pace.rl.rollout import Rollout, RolloutError
 from pace.rl.trainer import Trainer
-from pace.runs.checkpoint import CheckpointError, list_checkpoints, load_checkpoint
+from pace.runs.checkpoint import CheckpointError, load_checkpoint
+from pace.runs.checkpoint_folders import list_checkpoints
 from pace.runs.metrics import read_metrics
 from pace.runs.run_folder import RunFolder
 from tests.helpers.dummy import DummyTask

@@ -20,7 +20,7 @@ from pace.config.base import ConfigError, compose, parse
 from pace.config.commands import ExportConfig, PlayConfig
 from pace.deploy.export import ExportError, export_policy
 from pace.rl.policies import TaskPolicy, built_in_policy, load_policy
-from pace.runs.checkpoint import list_checkpoints
+from pace.runs.checkpoint_folders import list_checkpoints
 from pace.sim import render
 from pace.sim.ball.ball import ball_preset
 from pace.sim.render import RenderError
