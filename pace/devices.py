@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import torch
 
+from pace.config.automatic import Machine
 from pace.config.base import ConfigError
+
+GIB = 2**30
 
 
 def resolve_device(device: str | torch.device) -> torch.device:
@@ -26,3 +29,18 @@ def resolve_device(device: str | torch.device) -> torch.device:
             raise ConfigError(f"device {device} is not there: torch sees {count} GPU(s); use device=cpu")
         return torch.device("cuda", resolved.index or 0)
     return torch.device("cpu")
+
+
+def has_bf16(device: torch.device) -> bool:
+    """Whether ``device`` has units for bf16."""
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    return torch.cpu._is_avx512_bf16_supported()
+
+
+def machine_of(device: torch.device, count: int = 1) -> Machine:
+    """What ``auto`` depends on, with ``count`` of these devices."""
+    if device.type == "cuda":
+        memory = torch.cuda.get_device_properties(device).total_memory / GIB
+        return Machine("cuda", memory, has_bf16(device), count)
+    return Machine("cpu", bf16=has_bf16(device))

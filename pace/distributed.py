@@ -65,17 +65,21 @@ class ProcessGroup:
         self.all_reduce_mean_later(tensors)()
 
     def all_reduce_mean_later(self, tensors: Sequence[Tensor]) -> Callable[[], None]:
-        """Send ``tensors``; calling the returned function replaces each by its mean over the group."""
+        """Send ``tensors``; calling the returned function replaces each by its mean over the group.
+
+        A single tensor, which must be contiguous, is sent from where it lies, and must not change meanwhile.
+        """
         if self.size == 1:
             return lambda: None
-        flat = torch.cat([tensor.reshape(-1) for tensor in tensors])
+        alone = len(tensors) == 1
+        flat = tensors[0].view(-1) if alone else torch.cat([tensor.reshape(-1) for tensor in tensors])
         work = dist.all_reduce(flat, async_op=True)
         assert work is not None  # None is for processes outside the group
 
         def finish() -> None:
             work.wait()
             parts = flat.div_(self.size).split([tensor.numel() for tensor in tensors])
-            for tensor, part in zip(tensors, parts, strict=True):
+            for tensor, part in () if alone else zip(tensors, parts, strict=True):
                 tensor.copy_(part.view_as(tensor))
 
         return finish
@@ -154,6 +158,11 @@ def process_group(size: int, device: torch.device, arguments: Sequence[str] | No
 def under_torchrun() -> bool:
     """Whether ``torchrun`` started this process; it then sets the size of the group."""
     return "TORCHELASTIC_RUN_ID" in os.environ
+
+
+def launched_size() -> int:
+    """Processes that ``torchrun`` has started, on all machines; 1 without it."""
+    return int(os.environ["WORLD_SIZE"]) if under_torchrun() else 1
 
 
 def own_device(device: str) -> str:

@@ -24,8 +24,7 @@ from pace.predictor.network import PredictorNetwork
 from pace.predictor.regression import PredictorTrainer
 from pace.rl.agent import Agent, RunningNorm
 from pace.rl.ppo import PPO
-from pace.rl.rates import summarise
-from pace.rl.rollout import Rollout
+from pace.rl.rollout import Rollout, RolloutError
 from pace.rl.trainer import Trainer, restarts_worlds
 from pace.runs.checkpoint import flatten_tensors, load_checkpoint
 from pace.runs.metrics import read_metrics
@@ -182,17 +181,38 @@ def test_the_predictor_of_a_group_is_one_and_its_error_that_of_all_samples() -> 
         assert not torch.equal(one, old)
 
 
+def trainer_of(group: ProcessGroup) -> Trainer:
+    """Of a small run on the dummy task, without a run folder."""
+    config = load_train_config(["num_worlds=8", "tensorboard=false", "progress=false", "algo.actor_hidden=[8]"])
+    torch.manual_seed(1)
+    return Trainer(config, DummyTask(8, group.rank), PredictorNetwork(config.predictor), None, group)
+
+
 def test_rates_count_every_process() -> None:
     def rates(group: ProcessGroup) -> dict[str, float]:
         counts = {"serves": (4.0, 12.0), "hits": (4.0, 0.0), "successes": (1.0, 1.0), "falls": (0.0, 2.0)}
         rest = {"steps": (50.0, 50.0), "episodes": (1.0, 2.0), "reward_sum": (5.0, 15.0)}
-        return summarise({name: torch.tensor(v[group.rank]) for name, v in (counts | rest).items()}, 0.02, group)
+        trainer = trainer_of(group)
+        popped = {name: torch.tensor(v[group.rank]) for name, v in (counts | rest).items()}
+        trainer.env.pop_statistics = lambda: popped  # type: ignore[method-assign]
+        return trainer.update()
 
     for row in together(rates):
         assert row["hit_rate"] == 0.25
         assert row["success_rate"] == 0.125
         assert row["fall_rate"] == pytest.approx(1.0)
         assert row["mean_reward"] == pytest.approx(0.2)
+
+
+def test_a_fault_of_one_process_ends_all() -> None:
+    def fault(group: ProcessGroup) -> str:
+        trainer = trainer_of(group)
+        trainer.env.poison_step = 3 if group.rank == 1 else -1  # type: ignore[attr-defined]
+        with pytest.raises(RolloutError) as found:
+            trainer.update()
+        return str(found.value)
+
+    assert all("policy column 1 of world 3 at step 3" in text for text in together(fault))
 
 
 def test_size_suits_the_machine(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,10 +13,11 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from pace.bench import physics, report, training, update
+from pace.config.automatic import choose
 from pace.config.base import parse
 from pace.config.commands import BenchConfig
 from pace.cores import usable_cores
-from pace.devices import resolve_device
+from pace.devices import machine_of, resolve_device
 from pace.runs.run_folder import make_out, versions
 
 BUSY_LOAD = 0.5  # per core; a higher load gives a warning
@@ -24,7 +25,8 @@ BUSY_LOAD = 0.5  # per core; a higher load gives a warning
 
 def bench_from_config(composed: DictConfig) -> None:
     """Measure as configured; print the table, write the JSON, print its path."""
-    config = parse(composed, BenchConfig)
+    machine = machine_of(resolve_device(str(composed.device)))
+    config = parse(choose(composed, machine)[0], BenchConfig)
     overrides = [o for o in HydraConfig.get().overrides.task if not o.lstrip("+~").startswith("bench")]
     path = make_out(config.out, config.name) / report.FILE
     measure(config, overrides, path)

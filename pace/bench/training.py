@@ -53,6 +53,7 @@ def training_run(num_worlds: int, updates: int, overrides: list[str]) -> tuple[f
     with tempfile.TemporaryDirectory() as folder:
         settings = {
             "num_worlds": num_worlds,
+            "algo.steps": steps,
             "samples": updates * num_worlds * steps,
             "minutes": 0,
             "progress": "false",

@@ -11,6 +11,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from pace.arrays.graph import Graphs
 from pace.bench.timing import median_seconds
 from pace.config.commands import BenchConfig, BenchOptions
 from pace.config.training import AlgoConfig, load_train_config
@@ -26,6 +27,8 @@ class RandomTask:
 
     def __init__(self, options: BenchOptions, device: torch.device) -> None:
         worlds = options.update_worlds
+        self.graphs = Graphs.CUDA if device.type == "cuda" else Graphs.NONE
+        self.generator = torch.Generator(device)
         self.policy_observation = torch.randn(worlds, options.policy_size, device=device)
         self.critic_observation = torch.randn(worlds, options.critic_size, device=device)
         self.reward = torch.zeros(worlds, device=device)

@@ -83,6 +83,15 @@ def check_range(name: str, value: Range, lowest: float | None = None) -> None:
         require(value[0] >= lowest, f"{name}: {value[0]} is below {lowest}")
 
 
+class Completed:
+    """A configuration that may leave values open."""
+
+    @classmethod
+    def complete(cls, plain: DictConfig) -> DictConfig:
+        """``plain`` with a value for each that is open."""
+        raise NotImplementedError
+
+
 def parse(config: DictConfig | dict[str, Any], schema: type[T]) -> T:
     """Check ``config`` against a dataclass and return an instance of it.
 
@@ -91,6 +100,7 @@ def parse(config: DictConfig | dict[str, Any], schema: type[T]) -> T:
     try:
         plain = config if isinstance(config, DictConfig) else OmegaConf.create(config)
         OmegaConf.resolve(plain)
+        plain = schema.complete(plain) if issubclass(schema, Completed) else plain
         merged = OmegaConf.merge(OmegaConf.structured(schema), plain)
         parsed = OmegaConf.to_object(merged)
     except OmegaConfBaseException as error:

@@ -131,6 +131,10 @@ LIMITS: dict[str, dict[str, Limits]] = {
         "skips": (0, 10**6),
     },
     "Stage": {"samples": SAMPLES},
+    "DeviceValues": {
+        "num_worlds": (1, 2**24), "steps": (1, 10_000), "minibatches": (1, 10**6), "memory": (0.0, 1e6),
+        "memory_per_world": (0.0, 1e3),
+    },
     "TrainConfig": {
         "num_worlds": (1, 2**24), "processes": (0, 4096), "seed": SEED,
         "samples": (1.0, math.inf),  # inf: until minutes, or a signal

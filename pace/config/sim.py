@@ -190,16 +190,17 @@ class EngineConfig:
     ball_dt: float  # s, longest sub-step of the ball's flight
     largest_speed: float = field(default=0.0, kw_only=True)  # m/s, rad/s; a faster robot has diverged; 0: no limit
     remembered_steps: int = field(default=0, kw_only=True)  # control steps that a replay of a fault goes back; 0: none
-    graph: str = "auto"  # of CUDA for steps and resets on a GPU, of Warp for mjwarp on a CPU: auto, always, never
+    # of CUDA for steps and updates on a GPU, of Warp for mjwarp on a CPU: auto, always, never; or dry, which goes a
+    # GPU's way on a CPU and names what a graph could not hold
+    graph: str = "auto"
 
     def __post_init__(self) -> None:
         known = self.name in ("auto", "native", "mjwarp") or plugins.may_be_outside(plugins.ENGINES, self.name)
         wanted = "auto, native or mjwarp, or come from a module named in plugins=[...]"
         require(known, f"engine must be {wanted}, not {self.name!r}")
         require(self.physics_dt > 0, "engine.physics_dt must be positive")
-        require(
-            self.graph in ("auto", "always", "never"), f"engine.graph must be auto, always or never, not {self.graph!r}"
-        )
+        known = self.graph in ("auto", "always", "never", "dry")
+        require(known, f"engine.graph must be auto, always, never or dry, not {self.graph!r}")
         require(self.cone in ("pyramidal", "elliptic"), "engine.cone must be pyramidal or elliptic")
         require(self.threads >= 0, "engine.threads must be 0 (all cores) or more")
         for name in ("solver_iterations", "line_search_iterations", "contacts_per_world", "constraints_per_world"):

@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from pace.config import plugins
-from pace.config.base import compose, parse, require
+from omegaconf import DictConfig
+
+from pace.config import automatic, plugins
+from pace.config.base import Completed, compose, parse, require
 from pace.config.names import check_renamed
 from pace.config.predictor import FRAME_DT
 from pace.config.task import TaskConfig
@@ -45,9 +47,10 @@ class AlgoConfig:
     max_grad_norm: float
     observation_clip: float
     last_layer_gain: float
-    autocast: str  # auto (bf16 if the hardware supports it, down to fp32_below), bf16, fp32
+    # mixed (bf16, and fp32 from a std of fp32_below on), bf16, fp32; auto: mixed if the hardware supports it, else fp32
+    autocast: str
     later_steps: list[SchedulePoint] = field(default_factory=list)  # in place of steps from that many control steps on
-    fp32_below: float = 0.0  # mean std of the policy below which autocast=auto computes in float32
+    fp32_below: float = 0.0  # mean std of the policy below which autocast=mixed computes in float32
     algorithm: str = "ppo"  # or a class from outside: my_module:MyAlgorithm
     params: dict[str, float] = field(default_factory=dict)  # numbers of an algorithm from outside
     skips: int = 0  # updates in a row that are skipped because they are not finite, before the run stops
@@ -65,7 +68,8 @@ class AlgoConfig:
         for point in self.later_steps:
             whole = point.value >= 1 and point.value == int(point.value)
             require(whole, f"algo.later_steps: {point.value} is no number of steps")
-        require(self.autocast in ("auto", "bf16", "fp32"), "algo.autocast must be auto, bf16 or fp32")
+        known = ("auto", "mixed", "bf16", "fp32")
+        require(self.autocast in known, "algo.autocast must be auto, mixed, bf16 or fp32")
         require(self.fp32_below >= 0, "algo.fp32_below is a standard deviation: it cannot be negative")
         for name in ("gamma", "gae_lambda"):
             require(0 < getattr(self, name) <= 1, f"algo.{name} must lie in (0, 1]")
@@ -93,7 +97,7 @@ class Stage:
 
 
 @dataclass
-class TrainConfig(TaskConfig):
+class TrainConfig(TaskConfig, Completed):
     """``python -m pace.rl.train``: the task, the learner and the run."""
 
     algo: AlgoConfig
@@ -114,6 +118,11 @@ class TrainConfig(TaskConfig):
     predictor_from: str | None = field(default=None, kw_only=True)
     curriculum: list[Stage] = field(default_factory=list, kw_only=True)  # each changes the task of the one before
     plugins: list[str] = field(default_factory=list, kw_only=True)  # modules that add terms, observations, ...
+
+    @classmethod
+    def complete(cls, plain: DictConfig) -> DictConfig:
+        """Values of a CPU in place of ``auto``, if no machine was asked (:func:`pace.config.automatic.choose`)."""
+        return automatic.choose(plain, automatic.CPU)[0]
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -19,6 +19,7 @@ from torchrl.modules import IndependentNormal
 
 from pace.config.base import ConfigError
 from pace.config.training import AlgoConfig, SchedulePoint
+from pace.devices import has_bf16
 from pace.distributed import ProcessGroup
 
 SMALLEST_STD = 1e-4  # the scale module's own lower bound
@@ -39,13 +40,8 @@ def scheduled(points: Sequence[SchedulePoint], samples: float) -> float:
 
 def compute_dtype(autocast: str, device: torch.device) -> torch.dtype:
     """Number format of the matrix products: bf16 if configured, or (``auto``) if the hardware supports it."""
-    if autocast == "bf16":
-        return torch.bfloat16
-    if autocast == "fp32":
-        return torch.float32
-    if device.type == "cuda":
-        return torch.bfloat16 if torch.cuda.is_bf16_supported(including_emulation=False) else torch.float32
-    return torch.bfloat16 if torch.cpu._is_avx512_bf16_supported() else torch.float32
+    rounded = has_bf16(device) if autocast == "auto" else autocast in ("bf16", "mixed")
+    return torch.bfloat16 if rounded else torch.float32
 
 
 class Sizes(NamedTuple):
@@ -211,8 +207,10 @@ class Agent(nn.Module):
         super().__init__()
         if config.std_floor > min(point.value for point in config.std):
             raise ConfigError(f"algo.std_floor {config.std_floor} is above a value of the algo.std schedule")
-        self.fast_dtype = self.observation_dtype = compute_dtype(config.autocast, device)
-        self.fp32_below = config.fp32_below if config.autocast == "auto" else 0.0
+        self.fast_dtype = compute_dtype(config.autocast, device)
+        self.fp32_below = config.fp32_below if config.autocast in ("auto", "mixed") else 0.0
+        self.fine = config.std[0].value < self.fp32_below
+        self.observation_dtype = torch.float32 if self.fine else self.fast_dtype
         self.num_actions = actions
         self.policy_norm = RunningNorm(policy_size, config.observation_clip, config.observation_norm)
         self.critic_norm = RunningNorm(critic_size, config.observation_clip, config.observation_norm)
@@ -220,13 +218,18 @@ class Agent(nn.Module):
         self.critic = MLP(critic_size, config.critic_hidden, 1, 1.0, self.observation_dtype)
         self.to(device)
 
-    def choose_dtype(self) -> None:
-        """Compute in float32 once the policy's std is so small that rounding to bf16 is comparable to it.
+    def choose_dtype(self, std: float) -> None:
+        """Compute in float32 once the policy's mean ``std`` is so small that rounding to bf16 is comparable to it.
 
         The rounding errors differ with every change of the weights: the KL divergence of an update then measures the
-        rounding, and the learning rate, which follows the KL divergence, falls to its floor.
+        rounding, and the learning rate, which follows the KL divergence, falls to its floor. There is no way back:
+        each change replaces the storage of the rollouts and the graphs on it.
         """
-        fine = self.actor.std.mean().item() < self.fp32_below
+        self.compute_fine(self.fine or std < self.fp32_below)
+
+    def compute_fine(self, fine: bool) -> None:
+        """Compute in float32 from now on, or in the configured format."""
+        self.fine = fine
         self.observation_dtype = self.actor.mlp.dtype = self.critic.dtype = torch.float32 if fine else self.fast_dtype
 
     def actor_operator(self) -> ProbabilisticTensorDictSequential:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
@@ -55,8 +55,9 @@ class Algorithm(Protocol):
         """A fault of the rollout, such as a value that is not finite, or None. May wait for the device."""
         ...
 
-    def update(self, samples: float) -> dict[str, float]:
-        """Learn from the rollout; returns columns of the run's metrics, the same at each update.
+    def update(self, samples: float) -> Mapping[str, float | Tensor]:
+        """Learn from the rollout; returns columns of the run's metrics, the same at each update: numbers, or tensors ()
+        on the device, which the trainer reads together.
 
         Errors: :class:`pace.rl.rollout.RolloutError` if the run cannot continue.
         """
@@ -85,6 +86,32 @@ class Algorithm(Protocol):
         ``weights``: the ``state_dict`` of ``agent``; the critic's number in ``sizes`` is not known. Errors:
         :class:`pace.runs.checkpoint.CheckpointError` that begins with ``source``, if the weights do not fit.
         """
+        ...
+
+
+@runtime_checkable
+class InPlace(Protocol):
+    """What an :class:`Algorithm` has besides if it leaves out the host.
+
+    ``begin``, ``step`` and ``finish`` do the same work on the same tensors in each rollout, until :meth:`storage` is
+    another one; so a rollout can be a graph (:class:`pace.arrays.graph.CapturedCall`). ``fault`` is only asked after
+    the update, if the rollout was not :meth:`healthy`. The metrics of an update are finite, or it is undone.
+    """
+
+    def live_state(self) -> dict[str, Any]:
+        """``state_dict`` with the tensors themselves, without a wait: it is copied before each update."""
+        ...
+
+    def storage(self) -> object:
+        """What the rollout is stored in, after ``prepare``: another object has other tensors."""
+        ...
+
+    def healthy(self) -> Tensor:
+        """Whether the rollout has no fault, () bool. Asked after each update, and read with the metrics."""
+        ...
+
+    def learned(self, metrics: Mapping[str, float]) -> None:
+        """Called after an update, with all metrics of the run."""
         ...
 
 

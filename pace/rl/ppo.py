@@ -5,23 +5,28 @@ The update is TorchRL's ClipPPOLoss and KL-adaptive learning rate, over minibatc
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
-from torchrl.objectives import ClipPPOLoss, KLAdaptiveLR
 
+from pace.arrays.gradients import Gradients
+from pace.arrays.graph import CapturedCall, Graphs
+from pace.arrays.launch import Bound
 from pace.arrays.state import under_prefix
-from pace.config.base import ConfigError
 from pace.config.training import AlgoConfig
 from pace.distributed import ProcessGroup
+from pace.rl.adaptive_rate import KLAdaptiveRate
 from pace.rl.agent import Agent, Policy, RunningNorm, Sizes, scheduled
-from pace.rl.rollout import Rollout, RolloutError, VectorTask
+from pace.rl.loss import PPOLoss
+from pace.rl.minibatch import gather, minibatch_of
+from pace.rl.rollout import Rollout, VectorTask, require_finite
 from pace.runs.checkpoint import load_weights
-from pace.runs.optimiser import load_optimiser_state, optimiser_state
+from pace.runs.optimiser import adam, learning_rate, live_state, load_optimiser_state, optimiser_state
+from pace.runs.reading import read
 
 LOSS_METRICS = (
     "loss_objective",
@@ -34,100 +39,125 @@ LOSS_METRICS = (
 METRICS = ("kl", "grad_norm_actor", "grad_norm_critic", *LOSS_METRICS)
 
 
-class PPOLoss(ClipPPOLoss):
-    """ClipPPOLoss that also reports the exact mean KL divergence between the two Gaussians.
-
-    The loss's ``kl_approx`` is a mean of log-ratios: over a small minibatch its noise is comparable to the KL target,
-    and it can be negative, which the learning-rate schedule ignores.
-    """
-
-    kl: Tensor
-
-    def _get_cur_log_prob(self, tensordict: TensorDictBase, params: Any = None) -> tuple[Tensor, Any, bool]:
-        log_prob, dist, composite = super()._get_cur_log_prob(tensordict, params)
-        with torch.no_grad():
-            ratio = tensordict["old_scale"].square() / dist.variance
-            shift = (tensordict["old_loc"] - dist.mean).square() / dist.variance
-            self.kl = 0.5 * (shift + ratio - ratio.log() - 1.0).sum(-1).mean()
-        return log_prob, dist, composite
-
-
 class PPO:
     """Learner of an :class:`Agent`: one optimiser, gradient bound and parameter set each for actor and critic.
 
     The processes of a ``group`` learn from the union of their rollouts: gradients, KL and metrics are means over them.
+    An optimiser step is a graph if the rollout's environment has graphs; in a group it is two, with the exchange of the
+    gradients between them.
     """
 
     def __init__(self, agent: Agent, config: AlgoConfig, group: ProcessGroup | None = None) -> None:
         self.agent, self.config, self.group = agent, config, group or ProcessGroup()
-        self.loss = PPOLoss(
-            agent.actor_operator(),
-            agent.critic_operator(),
-            clip_epsilon=config.clip,
-            entropy_coeff=config.entropy[0].value,
-            critic_coeff=config.value_coefficient,
-            loss_critic_type="l2",
-            clip_value=config.clip if config.clip_value else None,
-            functional=False,
-        )
+        self.loss = PPOLoss(agent, config)
         self.actor_parameters = list(agent.actor.parameters())
         self.critic_parameters = list(agent.critic.parameters())
-        self.actor_optimiser = torch.optim.Adam(self.actor_parameters, lr=config.learning_rate, fused=True)
-        self.critic_optimiser = torch.optim.Adam(self.critic_parameters, lr=config.learning_rate, fused=True)
-        self.schedule = KLAdaptiveLR(
-            self.actor_optimiser,
-            config.kl_target[0].value,
-            min_lr=config.learning_rate_min,
-            max_lr=config.learning_rate_max,
-        )
-        self._minibatch: tuple[Rollout, TensorDict] | None = None
+        self.actor_optimiser = adam(self.actor_parameters, config.learning_rate)
+        self.critic_optimiser = adam(self.critic_parameters, config.learning_rate)
+        rate = learning_rate(self.actor_optimiser)
+        self.schedule = KLAdaptiveRate(rate, config.learning_rate_min, config.learning_rate_max)
+        self._gradients = Gradients(self.actor_parameters, self.critic_parameters)
+        self._metrics = torch.zeros(len(METRICS), device=rate.device)  # of an optimiser step
+        self._mean = torch.zeros_like(self._metrics)  # of an update
+        self._minibatch = Bound(self._make_minibatch, rollout=None)
 
     def update(self, rollout: Rollout, samples: float) -> dict[str, float]:
-        """Learn from one rollout, ``samples`` control steps into the run; returns the means of the update's metrics.
+        """:meth:`learn`, and read the metrics.
 
-        Errors: :class:`RolloutError` if a loss is not finite; the weights must then not be saved.
+        Errors: :class:`RolloutError` if one of them is not finite; the weights must then not be saved.
         """
-        self.loss.get_buffer("entropy_coeff").fill_(scheduled(self.config.entropy, samples))
-        self.schedule.target_kl = scheduled(self.config.kl_target, samples)
-        sources, batch = self._sources(rollout), self._buffers(rollout)
-        rows = batch.batch_size[0]
-        totals: list[Tensor] = []
-        for _ in range(self.config.epochs):
-            order = torch.randperm(rollout.steps * rollout.num_worlds, device=rollout.reward.device)
-            for index in order[: rows * self.config.minibatches].split(rows):
-                for name, source in sources.items():
-                    torch.index_select(source, 0, index, out=batch[name])
-                totals.append(self._learn(batch))
-        self.agent.actor.bound_std(self.config.std_floor, scheduled(self.config.std, samples))
-        mean = torch.stack(totals).mean(0)
-        self.group.all_reduce_mean_([mean])
-        metrics: dict[str, float] = dict(zip(METRICS, mean.tolist(), strict=True))
-        self._require_finite(metrics)
-        metrics["lr"] = self.schedule.get_last_lr()[0]
-        metrics["policy_std"] = self.agent.actor.std.mean().item()
+        metrics = read(self.learn(rollout, samples))
+        require_finite(metrics)
         return metrics
 
-    def _learn(self, batch: TensorDict) -> Tensor:
-        """One optimiser step of each network; returns its METRICS as one tensor."""
-        self.actor_optimiser.zero_grad(set_to_none=True)
-        self.critic_optimiser.zero_grad(set_to_none=True)
+    def learn(self, rollout: Rollout, samples: float) -> dict[str, Tensor]:
+        """Learn from one rollout, ``samples`` control steps into the run, without a wait for the device.
+
+        Returns the means of the update's metrics, (). Unless all are finite, the weights must not be saved.
+        """
+        self.loss.get_buffer("entropy_coeff").fill_(scheduled(self.config.entropy, samples))
+        self.schedule.target.fill_(scheduled(self.config.kl_target, samples))
+        sources = self._sources(rollout)
+        batch, step = self._minibatch(rollout)
+        rows, count = batch.batch_size[0], self.config.minibatches
+        self._mean.zero_()
+        for _ in range(self.config.epochs):
+            order = torch.randperm(rollout.steps * rollout.num_worlds, device=rollout.reward.device)
+            for index in order[: rows * count].split(rows):
+                gather(sources, index, batch)
+                step()
+        self.agent.actor.bound_std(self.config.std_floor, scheduled(self.config.std, samples))
+        self._mean.div_(self.config.epochs * count)
+        self.group.all_reduce_mean_([self._mean])
+        metrics = dict(zip(METRICS, self._mean.unbind(), strict=True))
+        return metrics | {"lr": learning_rate(self.actor_optimiser), "policy_std": self.agent.actor.std.mean()}
+
+    def _make_minibatch(self, rollout: Rollout) -> tuple[TensorDict, Callable[[], None]]:
+        """The buffers of a minibatch, and the optimiser step on them."""
+        batch = minibatch_of(rollout, self._sources(rollout), self.config.minibatches)
+        captured = partial(CapturedCall, device=rollout.reward.device, graphs=rollout.env.graphs)
+        if self.group.size > 1 or rollout.env.graphs is not Graphs.NONE:
+            self._gradients.hold()
+        if self.group.size == 1:
+            return batch, captured(partial(self._step, batch))
+        if rollout.env.graphs is Graphs.NONE:
+            return batch, partial(self._step_overlapping, batch)
+        return batch, partial(self._step_in_two, captured(partial(self._differentiate, batch)), captured(self._apply))
+
+    def _step(self, batch: TensorDict) -> None:
+        """One optimiser step of each network."""
+        self._differentiate(batch)
+        self._apply()
+
+    def _step_in_two(self, differentiate: Callable[[], None], apply: Callable[[], None]) -> None:
+        """The same in a group, in two graphs: the exchange between them is in none."""
+        differentiate()
+        self.group.all_reduce_mean_([self._gradients.flat])
+        apply()
+
+    def _step_overlapping(self, batch: TensorDict) -> None:
+        """The same in a group, without graphs: the exchange overlaps with the work on the other network."""
+        of_actor, of_critic = self._gradients.parts
+        out = self._differentiate_actor(batch)
+        receive_actors = self.group.all_reduce_mean_later([of_actor])
+        self._differentiate_critic(out)
+        receive_critics = self.group.all_reduce_mean_later([of_critic])
+        receive_actors()
+        self._apply_actor()
+        receive_critics()
+        self._apply_critic()
+
+    def _differentiate(self, batch: TensorDict) -> None:
+        self._differentiate_critic(self._differentiate_actor(batch))
+
+    def _differentiate_actor(self, batch: TensorDict) -> TensorDictBase:
+        """All losses; the actor's gradients, and the KL divergence beside them."""
+        self._gradients.zero_()
         out = self.loss(batch)
         (out["loss_objective"] + out["loss_entropy"]).backward()
-        receive_actors = self.group.all_reduce_mean_later([self.loss.kl, *gradients(self.actor_parameters)])
-        out["loss_critic"].backward()  # overlaps with the all-reduce of the actor's gradients, and vice versa below
-        receive_critics = self.group.all_reduce_mean_later(gradients(self.critic_parameters))
-        receive_actors()
-        kl = self.loss.kl.item()
-        if not math.isfinite(kl):
-            raise RolloutError("not finite: the policy's output in the PPO update (its KL divergence)")
-        self.schedule.step(kl)
-        actor_norm = nn.utils.clip_grad_norm_(self.actor_parameters, self.config.max_grad_norm)
-        self.actor_optimiser.step()
-        receive_critics()
-        critic_norm = nn.utils.clip_grad_norm_(self.critic_parameters, self.config.max_grad_norm)
-        self.critic_optimiser.step()
+        self._gradients.first.copy_(self.loss.kl)
+        return out
+
+    def _differentiate_critic(self, out: TensorDictBase) -> None:
+        out["loss_critic"].backward()
         values = [out.get(name, self.loss.kl.new_zeros(())) for name in LOSS_METRICS]
-        return torch.stack([v.detach().reshape(()) for v in (self.loss.kl, actor_norm, critic_norm, *values)])
+        self._metrics[-len(values) :].copy_(torch.stack([value.detach().reshape(()) for value in values]))
+
+    def _apply(self) -> None:
+        self._apply_actor()
+        self._apply_critic()
+
+    def _apply_actor(self) -> None:
+        kl = self._gradients.first
+        self.schedule.adapt(kl)
+        self._metrics[0].copy_(kl)
+        self._metrics[1].copy_(nn.utils.clip_grad_norm_(self.actor_parameters, self.config.max_grad_norm))
+        self.actor_optimiser.step()
+
+    def _apply_critic(self) -> None:
+        self._metrics[2].copy_(nn.utils.clip_grad_norm_(self.critic_parameters, self.config.max_grad_norm))
+        self.critic_optimiser.step()
+        self._mean.add_(self._metrics)
 
     def _sources(self, rollout: Rollout) -> dict[str, Tensor]:
         """Flat (steps * N, ...) views of the rollout by the loss's names; advantages standardised over all samples."""
@@ -148,47 +178,27 @@ class PPO:
             "state_value": rollout.value[:steps].view(-1, 1),
         }
 
-    def _buffers(self, rollout: Rollout) -> TensorDict:
-        """The minibatch buffers that all gathers write into; allocated at the first update from that storage."""
-        if self._minibatch is None or self._minibatch[0] is not rollout:
-            rows = rollout.steps * rollout.num_worlds // self.config.minibatches
-            if rows < 1:
-                raise ConfigError(
-                    f"algo.minibatches {self.config.minibatches} is more than the samples of an update, "
-                    f"num_worlds x algo.steps = {rollout.steps * rollout.num_worlds}"
-                )
-            sources = self._sources(rollout)
-            buffers = {name: torch.empty_like(source[:rows]) for name, source in sources.items()}
-            batch = TensorDict(buffers, batch_size=[rows])
-            batch["old_scale"] = rollout.scale.expand(rows, -1)
-            self._minibatch = rollout, batch
-        return self._minibatch[1]
-
-    def _require_finite(self, metrics: dict[str, float]) -> None:
-        for name, value in metrics.items():
-            if not math.isfinite(value):
-                raise RolloutError(f"not finite: {name} of the PPO update")
-
     def state_dict(self) -> dict[str, Any]:
         """Both optimisers' moments and the adapted learning rates."""
-        return {
-            "actor_optimiser": optimiser_state(self.actor_optimiser),
-            "critic_optimiser": optimiser_state(self.critic_optimiser),
-        }
+        return {name: optimiser_state(optimiser) for name, optimiser in self._optimisers()}
+
+    def live_state(self) -> dict[str, Any]:
+        """:meth:`state_dict` without a wait for the device: the tensors themselves."""
+        return {name: live_state(optimiser) for name, optimiser in self._optimisers()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore the result of :meth:`state_dict`."""
-        load_optimiser_state(self.actor_optimiser, state["actor_optimiser"])
-        load_optimiser_state(self.critic_optimiser, state["critic_optimiser"])
+        for name, optimiser in self._optimisers():
+            load_optimiser_state(optimiser, state[name])
 
-
-def gradients(parameters: list[nn.Parameter]) -> list[Tensor]:
-    """The gradients of those parameters that have one."""
-    return [parameter.grad for parameter in parameters if parameter.grad is not None]
+    def _optimisers(self) -> tuple[tuple[str, torch.optim.Adam], ...]:
+        return ("actor_optimiser", self.actor_optimiser), ("critic_optimiser", self.critic_optimiser)
 
 
 class AsymmetricPPO:
-    """PPO with an actor on sensed and a critic on true observations: see :class:`pace.rl.algorithm.Algorithm`.
+    """PPO with an actor on sensed and a critic on true observations.
+
+    See :class:`pace.rl.algorithm.Algorithm` and :class:`pace.rl.algorithm.InPlace`.
 
     Attributes: ``agent``, ``ppo`` its learner, ``rollout`` its storage, ``None`` before the first :meth:`prepare`.
     """
@@ -199,43 +209,55 @@ class AsymmetricPPO:
         self.config, self.group = config, group
         self.agent = Agent(*sizes, config, device)
         self.ppo = PPO(self.agent, config, group)
+        self._finish = Bound(self._make_finish, rollout=None)
 
     def prepare(self, env: VectorTask, samples: float) -> int:
-        """Allocate storage for these worlds, apply ``algo.later_steps``, and choose the networks' number format."""
+        """Allocate storage for these worlds in the networks' number format, and apply ``algo.later_steps``."""
         steps, old = self.config.steps_at(samples), self.rollout
-        self.agent.choose_dtype()
         fits = old is not None and old.env is env and old.steps == steps
         if old is None or not fits or old.policy.dtype != self.agent.observation_dtype:
             self.rollout = Rollout(env, self.agent, steps)
         return steps
 
-    @property
-    def _stored(self) -> Rollout:
+    def storage(self) -> Rollout:
+        """The storage of the rollout."""
         assert self.rollout is not None  # prepare() comes first
         return self.rollout
 
     def begin(self) -> None:
         """Freeze the policy's standard deviation; copy the normalisers' moments."""
         self._moments = [norm.moments() for norm in self._norms()]
-        self._stored.begin()
+        self.storage().begin()
 
     def step(self, t: int) -> None:
         """See :meth:`Rollout.step`."""
-        self._stored.step(t)
+        self.storage().step(t)
 
     def finish(self) -> None:
         """Values and advantages."""
-        self._stored.finish(self.config.gamma, self.config.gae_lambda)
+        self._finish(self.storage())()
+
+    def _make_finish(self, rollout: Rollout) -> CapturedCall:
+        finish = partial(rollout.finish, self.config.gamma, self.config.gae_lambda)
+        return CapturedCall(finish, rollout.reward.device, rollout.env.graphs)
+
+    def healthy(self) -> Tensor:
+        """See :meth:`Rollout.healthy`."""
+        return self.storage().healthy()
 
     def fault(self) -> str | None:
         """See :meth:`Rollout.fault`."""
-        return self._stored.fault()
+        return self.storage().fault()
 
-    def update(self, samples: float) -> dict[str, float]:
-        """One set of normalisers for all processes, then :meth:`PPO.update`."""
+    def update(self, samples: float) -> dict[str, Tensor]:
+        """One set of normalisers for all, then :meth:`PPO.learn`."""
         for norm, moments in zip(self._norms(), self._moments, strict=True):
             norm.pool(moments, self.group)
-        return self.ppo.update(self._stored, samples)
+        return self.ppo.learn(self.storage(), samples)
+
+    def learned(self, metrics: Mapping[str, float]) -> None:
+        """Choose the networks' number format by the policy's standard deviation."""
+        self.agent.choose_dtype(metrics["policy_std"])
 
     def _norms(self) -> tuple[RunningNorm, RunningNorm]:
         return self.agent.policy_norm, self.agent.critic_norm
@@ -244,7 +266,7 @@ class AsymmetricPPO:
         """A new run begins with the standard deviation of its configuration."""
         if new_run:
             self.agent.actor.bound_std(self.config.std_floor, self.config.std[0].value)
-        self.agent.choose_dtype()
+        self.agent.choose_dtype(self.agent.actor.std.mean().item())
 
     def describe(self) -> str:
         """The networks' number format."""
@@ -255,12 +277,18 @@ class AsymmetricPPO:
         return f"networks in {number_format}"
 
     def state_dict(self) -> dict[str, Any]:
-        """See :meth:`PPO.state_dict`."""
-        return self.ppo.state_dict()
+        """See :meth:`PPO.state_dict`; and whether the networks have come to float32."""
+        return self.ppo.state_dict() | {"fine": self.agent.fine}
+
+    def live_state(self) -> dict[str, Any]:
+        """See :meth:`PPO.live_state`."""
+        return self.ppo.live_state() | {"fine": self.agent.fine}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the result of :meth:`state_dict`."""
+        """Restore the result of :meth:`state_dict`. The number format of older runs follows from the policy."""
         self.ppo.load_state_dict(state)
+        if "fine" in state:
+            self.agent.compute_fine(state["fine"])
 
     @staticmethod
     def load_policy(weights: Mapping[str, Tensor], sizes: Sizes, config: AlgoConfig, source: str) -> Policy:

@@ -13,6 +13,7 @@ import time
 import torch
 from omegaconf import DictConfig
 
+from pace.arrays.graph import graphs_of
 from pace.config.base import ConfigError, parse, to_dict
 from pace.config.training import TrainConfig
 from pace.devices import resolve_device
@@ -22,6 +23,7 @@ from pace.predictor.regression import PredictorTrainer
 from pace.rl.practice import ServePractice
 from pace.runs.checkpoint import Checkpoint
 from pace.runs.interrupt import StopRequest
+from pace.runs.optimiser import learning_rate
 from pace.runs.progress import Progress
 from pace.runs.run_folder import METRICS, RunFolder
 
@@ -43,7 +45,10 @@ class PredictorRun:
         self.network = make_predictor(config.predictor).to(device)
         self.practice = ServePractice(config, device)
         self.practice.desynchronise()
-        self.trainer = PredictorTrainer(self.network, config.predictor, config.algo.steps, config.num_worlds)
+        graphs = graphs_of(config.engine, device)
+        self.trainer = PredictorTrainer(
+            self.network, config.predictor, config.algo.steps, config.num_worlds, graphs=graphs
+        )
 
     def play(self) -> None:
         """Record one rollout."""
@@ -54,8 +59,7 @@ class PredictorRun:
     def slow_down(self, done: float) -> None:
         """Learning rate for the share ``done`` of the run: half a cosine, to a hundredth of ``learning_rate``."""
         factor = 0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * done))
-        for group in self.trainer.optimiser.param_groups:
-            group["lr"] = factor * self.config.predictor.learning_rate
+        learning_rate(self.trainer.optimiser).fill_(factor * self.config.predictor.learning_rate)
 
     def train(self, run: RunFolder) -> dict[str, float]:
         """Fit rollout after rollout, to the end or to the first Ctrl-C or SIGTERM; each is measured before its fit.

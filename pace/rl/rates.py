@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 import math
-
-import torch
-from torch import Tensor
-
-from pace.distributed import ProcessGroup
+from collections.abc import Mapping
 
 COUNTS = ("serves", "hits", "successes", "falls", "episodes", "steps", "reward_sum", "diverged")
 
 
-def summarise(statistics: dict[str, Tensor], control_dt: float, group: ProcessGroup | None = None) -> dict[str, float]:
-    """Rates of the last rollout from the environments' sums over the ``group``; NaN if nothing was counted.
+def rates(sums: Mapping[str, float], control_dt: float) -> dict[str, float]:
+    """Rates of the last rollout from the sums over all worlds, of all processes; NaN if nothing was counted.
 
     ``hit_rate`` and ``success_rate`` are shares of the serves that ended, ``fall_rate`` is falls per second of a
     world's time, rewards are means per control step, and every other sum is given per serve.
     """
-    total = (group or ProcessGroup()).all_reduce_sum_(torch.stack([value.float() for value in statistics.values()]))
-    sums = dict(zip(statistics, total.tolist(), strict=True))
 
     def share(name: str, of: str) -> float:
         return sums[name] / sums[of] if sums[of] > 0 else math.nan

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
@@ -22,11 +22,20 @@ from pace.sim.replay import save_replay
 Row = dict[str, float]
 
 
+@runtime_checkable
+class Live(Protocol):
+    """A learner whose tensors can be copied on the device."""
+
+    def live_state(self) -> dict[str, Any]:
+        """Its ``state_dict`` with the tensors themselves."""
+        ...
+
+
 class LastGood:
     """A copy of everything that an update changes in a learner, renewed before each update and put back after a fault.
 
     Args: networks: by their part of a checkpoint; learners: objects with ``state_dict`` and ``load_state_dict``, such
-    as an algorithm with its optimisers.
+    as an algorithm with its optimisers. One that has a ``live_state`` besides is copied without a wait for the device.
     """
 
     def __init__(self, networks: Mapping[str, nn.Module], learners: Mapping[str, Any]) -> None:
@@ -37,7 +46,9 @@ class LastGood:
     @torch.no_grad()
     def keep(self) -> None:
         """Copy the current state, into the copies of before if the tensors are of the same kind."""
-        live = {name: part.state_dict() for name, part in (*self._networks.items(), *self._learners.items())}
+        live: dict[str, Any] = {name: part.state_dict() for name, part in self._networks.items()}
+        for name, part in self._learners.items():
+            live[name] = part.live_state() if isinstance(part, Live) else part.state_dict()
         tensors: list[Tensor] = []
         _replaced(live, lambda tensor: tensors.append(tensor) or tensor)
         kinds = [[(tensor.shape, tensor.dtype) for tensor in each] for each in (tensors, self._kept)]

@@ -9,12 +9,14 @@ numbers that it acted on.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
+from pace.arrays.graph import Graphs
 from pace.predictor.regression import PredictorSource
 from pace.rl.agent import Agent
 from pace.sim.replay import WorldReplay
@@ -26,6 +28,13 @@ class RolloutError(RuntimeError):
     """Training cannot continue with a value of the worlds; the message names the world and the quantity."""
 
 
+def require_finite(metrics: Mapping[str, float]) -> None:
+    """Errors: :class:`RolloutError` that names the first metric of an update that is not finite."""
+    for name, value in metrics.items():
+        if not math.isfinite(value):
+            raise RolloutError(f"not finite: {name} of the update")
+
+
 class VectorTask(Protocol):
     """In-place interface of the N worlds, all tensors on ``device``; see :class:`pace.rl.TableTennisEnv`."""
 
@@ -34,6 +43,8 @@ class VectorTask(Protocol):
     reward: Tensor  # (N,) float32
     terminated: Tensor  # (N,) bool
     truncated: Tensor  # (N,) bool
+    graphs: Graphs  # how its calls are captured, and those around them may be
+    generator: torch.Generator  # source of its random numbers
 
     def advance(self, action: Tensor) -> None:
         """One control step; afterwards the observations are those before any reset."""
@@ -153,18 +164,25 @@ class Rollout:
         self.advantage.copy_(advantage)
         self.value_target.copy_(target)
 
+    def healthy(self) -> Tensor:
+        """Whether there is no :meth:`fault`, ()."""
+        return self._finite() & ~self._twice()
+
     def fault(self) -> str | None:
-        """A fault that ends training: a value that is not finite, two truncations of one world. One host sync."""
-        agent = self.agent
-        finite = agent.policy_norm.finite & agent.critic_norm.finite
-        finite = finite & torch.isfinite(self.reward).all() & torch.isfinite(self.value).all()
-        twice = (self.truncated.sum(0) > 1).any()
-        finite_host, twice_host = torch.stack([finite, twice]).tolist()
-        if not finite_host:
+        """A fault that ends training: a value that is not finite, or two truncations of one world. Waits for the
+        device."""
+        if not bool(self._finite()):
             return self._describe_fault()
-        if twice_host:
+        if bool(self._twice()):
             return f"a world was truncated twice within {self.steps} steps: algo.steps must be shorter than an episode"
         return None
+
+    def _finite(self) -> Tensor:
+        finite = self.agent.policy_norm.finite & self.agent.critic_norm.finite
+        return finite & torch.isfinite(self.reward).all() & torch.isfinite(self.value).all()
+
+    def _twice(self) -> Tensor:
+        return (self.truncated.sum(0) > 1).any()
 
     def _describe_fault(self) -> str:
         """Name and position of the first value that is not finite; only called if there is one."""

@@ -8,19 +8,21 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
+from pace.arrays.graph import Graphs, graphs_of
+from pace.config import automatic
 from pace.config.base import ConfigError, parse, to_dict
 from pace.config.predictor import PredictorPriors
 from pace.config.training import RESUME_KEYS, TrainConfig
 from pace.cores import threads_of
-from pace.devices import resolve_device
-from pace.distributed import ProcessGroup, own_device, process_group, suitable_size
+from pace.devices import has_bf16, machine_of, resolve_device
+from pace.distributed import ProcessGroup, launched_size, own_device, process_group, suitable_size
 from pace.predictor.network import BallPredictor, make_predictor
 from pace.predictor.priors import resolve_priors
 from pace.rl.curriculum import Curriculum
@@ -49,18 +51,40 @@ def train_from_config(composed: DictConfig) -> None:
     else:
         saved = None
     device = resolve_device(own_device(config.device))
-    if saved and device.type != device_type_of(saved) and not any(key.startswith("processes=") for key in overrides):
-        config.processes = 0  # as many as suit this kind of device
+    if saved is None:
+        composed, chosen = automatic.choose(composed, machine_for(config, device))
+        config = parse(composed, TrainConfig)
+    else:
+        chosen = adapt(config, saved, device, overrides)
     config.processes = config.processes or suitable_size(config.num_worlds, device)
     arguments = overrides if hydra.mode == RunMode.MULTIRUN else None  # of this job; the command's are of all
     with process_group(config.processes, device, arguments) as group:
         trainer = build_trainer(config, saved, device, group)
         if trainer.run is not None:
-            announce(trainer, trainer.run, saved)
+            announce(trainer, trainer.run, saved, chosen)
         summary = trainer.train()
     if summary is not None:
         report(summary)
         trainer.stop.require_not_terminated()
+
+
+def machine_for(config: TrainConfig, device: torch.device) -> automatic.Machine:
+    """What ``auto`` depends on; a dry run takes the values of a GPU."""
+    if graphs_of(config.engine, device) is Graphs.DRY:
+        return automatic.Machine("cuda", bf16=True)
+    return machine_of(device, launched_size())
+
+
+def adapt(config: TrainConfig, saved: Checkpoint, device: torch.device, overrides: list[str]) -> dict[str, Any]:
+    """Fit a resumed run to another kind of device than it was saved on; returns the values that have changed."""
+    if device.type == device_type_of(saved):
+        return {}
+    if not any(key.startswith("processes=") for key in overrides):
+        config.processes = 0  # as many as suit this kind of device
+    if config.algo.autocast != "mixed" or has_bf16(device):
+        return {}
+    config.algo.autocast = "fp32"
+    return {"algo.autocast": "fp32"}
 
 
 def resumed_config(saved: Checkpoint, path: str, overrides: list[str]) -> TrainConfig:
@@ -183,8 +207,10 @@ def open_run(config: TrainConfig, first_update: int) -> RunFolder:
     return run
 
 
-def announce(trainer: Trainer, run: RunFolder, saved: Checkpoint | None) -> None:
-    """Print the run's task, device, starting point and folder."""
+def announce(trainer: Trainer, run: RunFolder, saved: Checkpoint | None, chosen: dict[str, Any]) -> None:
+    """Print the run's task, device, starting point and folder, and the values that were ``chosen`` for the device."""
+    if chosen:
+        print(f"for this device: {automatic.in_words(chosen)}")
     if saved is not None:
         new_worlds = ", with new worlds" if restarts_worlds(saved, trainer.group, trainer.device) else ""
         tell(f"resuming from {saved.path}{new_worlds}")

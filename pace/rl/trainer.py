@@ -18,9 +18,9 @@ from pace.predictor.regression import PredictorTrainer
 from pace.rl.agent import Sizes
 from pace.rl.algorithm import ALGORITHMS
 from pace.rl.curriculum import Curriculum
-from pace.rl.rates import summarise
 from pace.rl.recovery import Recovery
-from pace.rl.rollout import RolloutError, TrainableTask
+from pace.rl.rollout import TrainableTask
+from pace.rl.update import Update
 from pace.runs.checkpoint import Checkpoint, CheckpointError, load_weights
 from pace.runs.interrupt import StopRequest
 from pace.runs.learning_curve import plot_learning_curve
@@ -70,7 +70,11 @@ class Trainer:
         sizes = Sizes(policy_size, env.critic_observation.shape[1], env.action_spec.shape[-1])
         self.algorithm = ALGORITHMS[config.algo.algorithm](sizes, config.algo, self.device, group)
         group.broadcast_([tensor for _, module in self._networks() for tensor in module.state_dict().values()])
-        self.regression = PredictorTrainer(predictor, config.predictor, config.algo.steps, self.num_worlds, group)
+        self.regression = PredictorTrainer(
+            predictor, config.predictor, config.algo.steps, self.num_worlds, group, env.graphs
+        )
+        networks = [module for _, module in self._networks()]
+        self._update = Update(self.algorithm, self.regression, networks, config.robot.control_dt, group)
         self.updates, self.samples, self.wall_s = 0, 0, 0.0
         learners = {LEARNER: self.algorithm, "regression": self.regression}
         self._recovery = Recovery(config, dict(self._networks()), learners, run, group)
@@ -151,35 +155,17 @@ class Trainer:
             self.env = self.curriculum.worlds
 
     def update(self) -> dict[str, float]:
-        """One rollout and one training update on it; returns the row of metrics, without the times."""
-        self._play()
-        self._require_no_fault()
-        prediction = self.regression.update()
-        learning = self.algorithm.update(self.samples)
+        """One rollout and one training update on it; returns the row of metrics, without the times.
+
+        Errors: see :class:`pace.rl.update.Update`.
+        """
+        metrics = self._update(self.env, self.samples)
         self.samples += self._samples_per_update
         self.updates += 1
-        task = summarise(self.env.pop_statistics(), self.config.robot.control_dt, self.group)
         if self.config.curriculum and self.curriculum is not None:
-            task["stage"] = float(self.curriculum.stage)
+            metrics["stage"] = float(self.curriculum.stage)
         self._move_on()
-        return {"update": self.updates, "samples": self.samples, **task, **prediction, **learning}
-
-    def _play(self) -> None:
-        """One rollout, recorded for the predictor."""
-        steps = self.algorithm.prepare(self.env, self.samples)
-        if steps != self.regression.steps:
-            self.regression.resize(steps)
-        self.algorithm.begin()
-        for t in range(steps):
-            self.regression.record(t, self.env)
-            self.algorithm.step(t)
-        self.algorithm.finish()
-
-    def _require_no_fault(self) -> None:
-        """Errors: :class:`RolloutError`, on every rank, if the rollout of one of them has a fault."""
-        faults = [fault for fault in self.group.gather(self.algorithm.fault()) if fault is not None]
-        if faults:
-            raise RolloutError(faults[0])
+        return {"update": self.updates, "samples": self.samples, **metrics}
 
     def _reason_to_end(self, seconds: float) -> str | None:
         if self.stop.name is not None:

@@ -19,7 +19,8 @@ from typing import IO
 from tqdm import tqdm
 
 from pace.command import quote
-from pace.config.base import ConfigError, parse, search_override, to_dict
+from pace.config.automatic import left_open
+from pace.config.base import ConfigError, compose, parse, search_override, to_dict
 from pace.config.training import RESUME_KEYS, TrainConfig, load_train_config
 from pace.cores import core_set, usable_cores
 from pace.runs.checkpoint import read_meta
@@ -84,13 +85,14 @@ def check_settings(run: Run) -> Run:
     """
     config = load_train_config(list(run.overrides))
     run, asked = replace(run, plugins=tuple(config.plugins)), _flat(to_dict(config))
+    open_keys = left_open(compose("train", list(run.overrides)))
     checkpoints = list_checkpoints(run.folder)
     if not checkpoints:
         return run
     saved = read_meta(checkpoints[-1])["config"]
     there = _flat(to_dict(parse(saved, TrainConfig)))
     for key in sorted(set(asked) | set(there)):
-        if not _is_free(key, asked) and asked.get(key) != there.get(key):
+        if key not in open_keys and not _is_free(key, asked) and asked.get(key) != there.get(key):
             what = f"{key} {there.get(key)}, and {asked.get(key)} is asked for"
             raise ConfigError(f"{run.folder} was trained with {what}: give another out=")
     return run

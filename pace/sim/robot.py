@@ -169,7 +169,8 @@ def _count_the_world_alone(spec: mujoco.MjSpec) -> None:
     """Sensors that count a geom's contacts count those with floor and table, the geoms of the world, and no others.
 
     A forearm that leans on the trunk is stopped, as on the robot. It is no contact of the kind that the paper's reward
-    punishes, a fall or a hit of the table, and counting it twice, for either part, would outweigh the whole play.
+    punishes, a fall or a hit of the table. Counted, for either part, it would cost pretrained/campaign more than its
+    successes pay (docs/results/robots.md).
     """
     for sensor in spec.sensors:
         if sensor.name.endswith(TOUCH):

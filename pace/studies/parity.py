@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pace.runs.metrics import markdown
+from pace.sim.robot_spec import TOUCH
 from pace.sim.worlds import Worlds
 from pace.studies.common import COLOURS, Array, model_of, smooth_swings, standing, study_config, study_spec
 from pace.studies.throws import throw
@@ -112,12 +113,21 @@ def limbs_only(model: mujoco.MjModel) -> mujoco.MjModel:
     return model
 
 
+def counting_all(model: mujoco.MjModel) -> mujoco.MjModel:
+    """The model whose sensors count all contacts of a geom, those with other parts of the robot as well."""
+    touch = [index for index in range(model.nsensor) if model.sensor(index).name.endswith(TOUCH)]
+    model.sensor_reftype[touch], model.sensor_refid[touch] = mujoco.mjtObj.mjOBJ_UNKNOWN, -1
+    return model
+
+
 def play(engine: str, nudge: float, scenario: Scenario, balls: Balls) -> Play:
     """Roll out a scenario. ``balls``: the throws; the first rollout, which finds it empty, aims and fills it."""
     config = study_config(name=engine, cone=scenario.cone)
     count = scenario.velocity.shape[0]
     everyone = torch.ones(count, dtype=torch.bool)
-    model = model_of(config) if scenario.convex else limbs_only(model_of(config))
+    model = counting_all(model_of(config))
+    if not scenario.convex:
+        model = limbs_only(model)
     worlds = Worlds(config, count, "cpu", model=model)
     qpos = standing(config, count)
     qpos[:, 7:] += nudge

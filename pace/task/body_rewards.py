@@ -69,14 +69,32 @@ def both_feet_air(state: TaskState, params: Params) -> Tensor:
     return (state.measures["feet_down"] == 0.0).float()
 
 
+def _ready(state: TaskState, params: Params) -> Tensor:
+    """There is nothing to hit and the base is within ``reach`` m of where it should stand, (N,) bool."""
+    return ~state.something_to_hit & (length(state.base_error) < params["reach"])
+
+
 @term("reach", "sigma")
 def ready_stance(state: TaskState, params: Params) -> Tensor:
     """Still feet where there is nothing to hit and the base is within ``reach`` m of where it should stand.
 
     exp(-v / sigma), v the speeds of both feet summed, m/s: stepping on the spot earns less than standing.
     """
-    ready = ~state.something_to_hit & (length(state.base_error) < params["reach"])
-    return torch.exp(length(state.robot.foot_velocity).sum(1) * (-1.0 / params["sigma"])) * ready
+    speed = length(state.robot.foot_velocity).sum(1)
+    return torch.exp(speed * (-1.0 / params["sigma"])) * _ready(state, params)
+
+
+@term("reach", "sigma")
+def ready_joints(state: TaskState, params: Params) -> Tensor:
+    """Still joints at the same time: exp(-w / sigma), w the root mean square of the joints' speeds, rad/s."""
+    speed = state.robot.joint_velocity.square().mean(1).sqrt_()
+    return torch.exp(speed * (-1.0 / params["sigma"])) * _ready(state, params)
+
+
+@term("reach", "height")
+def ready_height(state: TaskState, params: Params) -> Tensor:
+    """How much lower than ``height`` the base is at the same time, m."""
+    return (params["height"] - state.robot.base_position[:, 2]).clamp(min=0.0) * _ready(state, params)
 
 
 @term("threshold", "limit")

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from pace.arrays.graph import may_look
 from pace.arrays.state import Stateful
 from pace.task.signals import put
 
@@ -71,7 +72,7 @@ class History(Stateful):
     def fill(self, mask: Tensor) -> None:
         """Set all frames of the worlds of ``mask`` (N,) bool to one made of the current signals."""
         self._signals.compute()
-        rows = mask.nonzero().squeeze(1) if mask.device.type == "cpu" else slice(None)
+        rows = mask.nonzero().squeeze(1) if may_look(mask) else slice(None)
         frame = torch.cat([signal[rows] for signal in self._signals.tensors], dim=1)
         put(self.frame, frame, mask, rows)
         put(self.frames, frame.unsqueeze(1), mask, rows)

@@ -9,6 +9,7 @@ import warp as wp
 from torch import Tensor
 
 from pace.arrays.draws import Column, UniformSampler, columns_of
+from pace.arrays.graph import may_look
 from pace.arrays.launch import Launch, MaskedLaunch
 from pace.arrays.state import Stateful
 from pace.config.sim import RobotConfig
@@ -139,7 +140,7 @@ class ServeSampler(Stateful):
             self._try(self._pending)
             self._forecast(self._pending)
             self._reject()
-            if self._pending.device.type == "cpu" and not bool(self._pending.any()):
+            if may_look(self._pending) and not bool(self._pending.any()):
                 break
         return self.launch
 

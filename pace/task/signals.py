@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from pace.arrays.graph import may_look
 from pace.config.task import TaskConfig
 from pace.onboard.actor import Onboard, PaddlePose, Predictor, Readings, Signals
 from pace.onboard.ball_track import Track
@@ -58,7 +59,7 @@ class ActorSignals(Signals):
 
         On a CPU only those worlds are computed: reading the mask costs no wait there, and few worlds are new.
         """
-        rows = mask.nonzero().squeeze(1) if mask.device.type == "cpu" else slice(None)
+        rows = mask.nonzero().squeeze(1) if may_look(mask) else slice(None)
         with torch.no_grad(), torch.autocast(self.action.device.type, enabled=False):
             found = self.onboard.begin(Readings(*(reading[rows] for reading in self.sensing)), self.action[rows])
         if self.predictor is not None:

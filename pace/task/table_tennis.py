@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pace.arrays.graph import CapturedCall, graphs_wanted
+from pace.arrays.graph import CapturedCall, Graphs, graphs_of, may_look
 from pace.arrays.state import Stateful, tensors_named, under_prefix, with_prefix
 from pace.config.task import TaskConfig
 from pace.onboard.actor import Predictor
@@ -45,6 +45,8 @@ class TableTennis:
 
     On a GPU a step and a reset are a CUDA graph each (:class:`pace.arrays.graph.CapturedCall`; ``engine.graph``): the
     configuration and the predictor's tensors are those of the second step, and are changed in place or not at all.
+    ``graphs`` says how a caller may capture them together with what surrounds them, ``generator`` is their source of
+    random numbers.
 
     A task whose reward has no terms (:func:`pace.config.overrides.without_reward`) pays 0.
 
@@ -115,9 +117,9 @@ class TableTennis:
 
     def _capture(self) -> None:
         device = self.worlds.device
-        enabled = graphs_wanted(self.config.engine, device)
-        self._step_in_place = CapturedCall(self._advance, device, enabled, self.generator)
-        self._reset_in_place = CapturedCall(self._begin_episodes, device, enabled, self.generator)
+        self.graphs = graphs_of(self.config.engine, device)
+        self._step_in_place = CapturedCall(self._advance, device, self.graphs, self.generator)
+        self._reset_in_place = CapturedCall(self._begin_episodes, device, self.graphs, self.generator)
 
     @property
     def warmup_serves(self) -> int:
@@ -169,7 +171,7 @@ class TableTennis:
 
         On a CPU, where looking costs no wait, an empty mask returns at once.
         """
-        if self.worlds.device.type == "cpu" and not bool(mask.any()):
+        if self.graphs is Graphs.NONE and may_look(mask) and not bool(mask.any()):
             return
         self._reset_in_place(mask)
 

@@ -1,4 +1,4 @@
-"""A step and a reset as graphs do what they do without: on a CPU with the graph emulated, on a GPU with CUDA's."""
+"""A step and a reset as graphs do what they do without: on a CPU in a dry run, on a GPU with CUDA's."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from pace.arrays.graph import CapturedCall
+from pace.arrays.graph import CapturedCall, Graphs, graphs_of, may_look
 from pace.arrays.launch import Launch
 from pace.config.base import ConfigError
 from pace.predictor.network import PredictorNetwork
 from pace.task.env import TableTennisEnv
-from tests.helpers.emulation import Recording, take_the_gpus_way
+from tests.helpers.emulation import without_replay
 from tests.helpers.fakes import config
 
 N, STEPS = 4, 50
@@ -33,31 +33,16 @@ def make(device: str = "cpu", *overrides: str) -> TableTennisEnv:
     return TableTennisEnv(settings, N, device, 1, PredictorNetwork(settings.predictor).to(device))
 
 
-@pytest.fixture
-def emulated(monkeypatch: pytest.MonkeyPatch) -> list[Recording]:
-    """Calls are captured on the CPU; the list of the recordings made."""
-    made: list[Recording] = []
-
-    def capture(self: CapturedCall, inputs: tuple[Tensor, ...]) -> Recording:
-        made.append(Recording(self._function, inputs))
-        return made[-1]
-
-    monkeypatch.setattr(CapturedCall, "_capture", capture)
-    return made
-
-
 def captured(function: Any) -> CapturedCall:
-    """A call whose graph is emulated."""
-    return CapturedCall(function, torch.device("cpu"), enabled=True)
+    return CapturedCall(function, torch.device("cpu"), Graphs.DRY)
 
 
-def test_a_call_is_replayed_with_new_arguments_and_new_random_draws(emulated: list[Recording]) -> None:
-    total, drawn, calls = torch.zeros(3), torch.zeros(3), []
+def test_a_call_is_replayed_with_new_arguments_and_new_random_draws() -> None:
+    total, drawn = torch.zeros(3), torch.zeros(3)
     generator = torch.Generator().manual_seed(3)
     expected = torch.rand(4, 3, generator=torch.Generator().manual_seed(3))
 
     def function(value: Tensor) -> None:
-        calls.append(None)
         drawn.copy_(torch.rand(3, generator=generator))
         total[1:] += (2.0 * value)[1:]
 
@@ -66,31 +51,25 @@ def test_a_call_is_replayed_with_new_arguments_and_new_random_draws(emulated: li
         call(torch.full((3,), float(k)))
         torch.testing.assert_close(drawn, expected[k], rtol=0, atol=0)
     assert total.tolist() == [0.0, 12.0, 12.0]  # 2 (0 + 1 + 2 + 3)
-    assert len(calls) == 2  # as it is, and to be captured
-    assert len(emulated) == 1
 
 
-def test_a_number_that_python_counts_stands_still_in_a_graph(emulated: list[Recording]) -> None:
-    """What the comparison below would find."""
-    seen, count = torch.zeros(()), [0]
-
-    def function() -> None:
-        count[0] += 1
-        seen.fill_(count[0])
-
-    call = captured(function)
-    values = [(call(), float(seen))[1] for _ in range(4)]
-    assert values == [1.0, 2.0, 2.0, 2.0]
-
-
-def test_a_call_within_another_is_part_of_it(emulated: list[Recording]) -> None:
+def test_a_call_within_another_is_part_of_it() -> None:
     count = torch.zeros(())
     inner = captured(lambda: count.add_(1.0))
     outer = captured(lambda: inner())
     for _ in range(5):
         outer()
     assert count == 5.0
-    assert len(emulated) == 1
+    assert outer._graph is not None
+    assert inner._graph is None
+
+
+def test_the_host_may_look_outside_of_what_a_graph_could_hold() -> None:
+    mask, seen = torch.ones(2, dtype=torch.bool), []
+    captured(lambda: seen.append(may_look(mask)))()
+    CapturedCall(lambda: seen.append(may_look(mask)), torch.device("cpu"), Graphs.NONE)()
+    assert seen == [False, True]
+    assert not may_look(mask.to("meta"))
 
 
 def play(env: TableTennisEnv, steps: int = STEPS) -> list[dict[str, Any]]:
@@ -106,19 +85,19 @@ def play(env: TableTennisEnv, steps: int = STEPS) -> list[dict[str, Any]]:
 
 
 @pytest.mark.slow
-def test_replayed_steps_and_resets_equal_those_without_a_graph(emulated: list[Recording]) -> None:
+def test_replayed_steps_and_resets_equal_those_without_a_graph(monkeypatch: pytest.MonkeyPatch) -> None:
     """Bit for bit, though a replay has nothing but the operators, numbers and addresses of the second call."""
-    plain, graphed = make(), make()
-    for env in (plain, graphed):
-        take_the_gpus_way(env)
-    for call in (graphed._step_in_place, graphed._reset_in_place):
-        call._enabled = True
-    graphed._reset_in_place._inputs = (torch.zeros(N, dtype=torch.bool),)  # its first call has been the constructor's
-    expected, states = play(plain, 5), play(graphed, 5)
-    for env in (plain, graphed):
+
+    def played() -> tuple[TableTennisEnv, list[dict[str, Any]]]:
+        env = make("cpu", "engine.graph=dry")
+        states = play(env, 5)
         env.warmup_serves = 2
-    expected, states = expected + play(plain), states + play(graphed)
-    assert len(emulated) == 2  # the step with the engine's part in it, and the reset
+        return env, states + play(env)
+
+    graphed, states = played()
+    assert graphed._step_in_place._graph is not None
+    without_replay(monkeypatch)
+    plain, expected = played()
     for step, (state, other) in enumerate(zip(states, expected, strict=True)):
         for name, value in other.items():
             torch.testing.assert_close(
@@ -133,8 +112,12 @@ def test_replayed_steps_and_resets_equal_those_without_a_graph(emulated: list[Re
 def test_graphs_need_a_gpu() -> None:
     with pytest.raises(ConfigError, match=r"engine\.graph=always needs a GPU, and the device is cpu"):
         make("cpu", "engine.graph=always")
-    with pytest.raises(ConfigError, match=r"engine\.graph must be auto, always or never, not 'on'"):
+    with pytest.raises(ConfigError, match=r"engine\.graph must be auto, always, never or dry, not 'on'"):
         config("engine.graph='on'")
+    with pytest.raises(ConfigError, match=r"engine\.graph=dry takes a GPU's engine: give engine=mjwarp, or"):
+        make("cpu", "engine=native", "engine.graph=dry")
+    with pytest.raises(ConfigError, match=r"engine\.graph=dry goes a GPU's way on a CPU: give device=cpu"):
+        graphs_of(config("engine.graph=dry").engine, torch.device("cuda"))
 
 
 @wp.kernel
@@ -156,7 +139,7 @@ def test_a_cuda_graph_holds_torchs_and_warps_work() -> None:
         drawn.copy_(scale * torch.rand(8, device=device, generator=generator))
         add()
 
-    call = CapturedCall(function, device, True, generator)
+    call = CapturedCall(function, device, Graphs.CUDA, generator)
     expected = torch.zeros(8, device=device)
     for k in range(6):
         call(torch.full((8,), float(k), device=device))

@@ -142,7 +142,7 @@ def test_missing_key_is_named(key: str) -> None:
         ("engine.cone=round", "engine.cone must be pyramidal or elliptic"),
         ("algo.gamma=1.1", r"algo.gamma must lie in \(0, 1\]"),
         ("algo.minibatches=0", "algo.minibatches must be at least 1"),
-        ("algo.autocast=fp8", "algo.autocast must be auto, bf16 or fp32"),
+        ("algo.autocast=fp8", "algo.autocast must be auto, mixed, bf16 or fp32"),
         ("algo.std=[]", "algo.std needs at least one point"),
         ("randomization.kp_scale=[1.1,0.9]", "randomization.kp_scale: low 1.1 is above high 0.9"),
         ("minutes=-1", "minutes must not be negative"),

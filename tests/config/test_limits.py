@@ -10,7 +10,7 @@ from typing import Any, get_args, get_type_hints
 
 import pytest
 
-from pace.config import ball, commands, predictor, quality, sim, task, training
+from pace.config import automatic, ball, commands, predictor, quality, sim, task, training
 from pace.config.base import ConfigError, parse
 from pace.config.limits import LIMITS, first_outside, limits_of
 from pace.config.training import TrainConfig, load_train_config
@@ -19,7 +19,7 @@ from tests.helpers.recipes import defaults
 
 
 def classes() -> list[type]:
-    modules = (ball, commands, predictor, quality, sim, task, training)
+    modules = (automatic, ball, commands, predictor, quality, sim, task, training)
     found = {cls for module in modules for cls in vars(module).values() if isinstance(cls, type) and is_dataclass(cls)}
     return sorted(found, key=lambda cls: cls.__name__)
 

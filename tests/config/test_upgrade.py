@@ -153,7 +153,7 @@ def test_a_state_of_format_2_gets_what_the_true_world_keeps() -> None:
     assert env["statistics.sums"].tolist() == [*range(16), 0, 0]
 
 
-@pytest.mark.parametrize("robot", ["t1", "t1_29dof"])
+@pytest.mark.parametrize("robot", ["t1_paper", "t1_29dof"])
 def test_a_saved_robot_has_the_hands_of_its_mjcf(robot: str) -> None:
     now = to_dict(load_train_config([f"robot={robot}"]))
     old = deepcopy(now)

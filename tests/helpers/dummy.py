@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from torchrl.data import Unbounded
 
+from pace.arrays.graph import Graphs
 from pace.sim.replay import WorldReplay
 
 STATE = (
@@ -23,9 +24,12 @@ STATE = (
 class DummyTask:
     """N independent points in the plane; see the module's docstring."""
 
-    def __init__(self, num_worlds: int = 32, seed: int = 1, length: int = 20, outputs: int = 7) -> None:
+    def __init__(
+        self, num_worlds: int = 32, seed: int = 1, length: int = 20, outputs: int = 7, graphs: Graphs = Graphs.NONE
+    ) -> None:
         self.num_worlds, self.length, self.outputs = num_worlds, length, outputs
         self.device = torch.device("cpu")
+        self.graphs = graphs
         self.generator = torch.Generator().manual_seed(seed)
         self.action_spec = Unbounded(torch.Size([num_worlds, 2]))
         self.position = torch.zeros(num_worlds, 2)
@@ -42,9 +46,11 @@ class DummyTask:
         self.predictor_target = torch.zeros(num_worlds, outputs)
         self.predictor_valid = torch.ones(num_worlds, dtype=torch.bool)
         self.predictor_time_to_apex = torch.zeros(num_worlds)
-        self.statistics: dict[str, Tensor] = {}
+        names = ("serves", "hits", "successes", "falls", "episodes", "steps", "reward_sum", "reward/distance")
+        self.statistics = {name: torch.zeros(()) for name in names}
         self.poison_step = -1  # count of steps until a NaN appears; negative: never
-        self._clear_statistics()
+        self._start = torch.tensor([1.3, 0.0, 1.0])
+        self._slowest, self._fastest = torch.tensor([-6.5, -0.8, -0.5]), torch.tensor([-5.0, 0.4, 0.5])
         self.reset_worlds(torch.ones(num_worlds, dtype=torch.bool))
         self.age.copy_(torch.randint(0, length, (num_worlds,), generator=self.generator))
 
@@ -68,8 +74,8 @@ class DummyTask:
         masked = mask[:, None]
         self.position.copy_(torch.where(masked, draw(-1, 1, 2), self.position))
         self.target.copy_(torch.where(masked, draw(-1, 1, 2), self.target))
-        self.ball.copy_(torch.where(masked, torch.tensor([1.3, 0.0, 1.0]) + draw(-0.1, 0.1, 3), self.ball))
-        low, high = torch.tensor([-6.5, -0.8, -0.5]), torch.tensor([-5.0, 0.4, 0.5])
+        self.ball.copy_(torch.where(masked, self._start + draw(-0.1, 0.1, 3), self.ball))
+        low, high = self._slowest, self._fastest
         self.ball_velocity.copy_(torch.where(masked, low + (high - low) * draw(0, 1, 3), self.ball_velocity))
         self.age.masked_fill_(mask, 0)
         self._observe()
@@ -87,10 +93,6 @@ class DummyTask:
         if self.outputs == 7:
             self.predictor_target[:, 3:6] = end
             self.predictor_target[:, 6] = self.predictor_time_to_apex
-
-    def _clear_statistics(self) -> None:
-        names = ("serves", "hits", "successes", "falls", "episodes", "steps", "reward_sum", "reward/distance")
-        self.statistics = {name: torch.zeros(()) for name in names}
 
     def _count(self, distance: Tensor) -> None:
         done = self.terminated | self.truncated
@@ -114,8 +116,9 @@ class DummyTask:
         """Nothing can overflow here."""
 
     def pop_statistics(self) -> dict[str, Tensor]:
-        popped = self.statistics
-        self._clear_statistics()
+        popped = {name: value.clone() for name, value in self.statistics.items()}
+        for value in self.statistics.values():
+            value.zero_()
         return popped
 
     def state_dict(self) -> dict[str, Any]:

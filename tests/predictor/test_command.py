@@ -53,7 +53,7 @@ def test_the_learning_rate_falls_and_a_stop_keeps_what_was_learned(
     fit = PredictorTrainer.update
 
     def update(trainer: PredictorTrainer) -> dict[str, float]:
-        rates.append(trainer.optimiser.param_groups[0]["lr"])
+        rates.append(float(trainer.optimiser.param_groups[0]["lr"]))
         if len(rates) == 3:
             os.kill(os.getpid(), signal.SIGINT)
         return fit(trainer)

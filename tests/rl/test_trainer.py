@@ -17,7 +17,7 @@ from pace.config.base import ConfigError, parse, to_dict
 from pace.config.training import SchedulePoint, TrainConfig, load_train_config
 from pace.predictor.network import PredictorNetwork
 from pace.rl.ppo import AsymmetricPPO
-from pace.rl.rates import summarise
+from pace.rl.rates import rates
 from pace.rl.rollout import Rollout, RolloutError
 from pace.rl.trainer import Trainer
 from pace.runs.checkpoint import CheckpointError, load_checkpoint
@@ -289,7 +289,7 @@ def test_rates_of_the_statistics() -> None:
         "serves": 8.0, "hits": 4.0, "successes": 2.0, "falls": 3.0, "episodes": 5.0, "steps": 600.0,
         "reward_sum": 60.0, "reward/hit": 30.0, "net": 1.0,
     }  # fmt: skip
-    row = summarise({name: torch.tensor(value) for name, value in sums.items()}, control_dt=0.02)
+    row = rates(sums, control_dt=0.02)
     assert (row["hit_rate"], row["success_rate"], row["net"]) == (0.5, 0.25, 0.125)
     assert row["fall_rate"] == pytest.approx(0.25)  # 3 falls in 600 x 0.02 s
     assert (row["mean_reward"], row["reward/hit"]) == pytest.approx((0.1, 0.05))

@@ -179,7 +179,7 @@ def beside(model: mujoco.MjModel, qpos: Array, seed: int, reach: float) -> Array
 
 
 def test_shapes_are_all_collision_geoms_but_the_paddle(model: mujoco.MjModel) -> None:
-    for built, more in ((scene(), 0), (model, 2), (scene("t1_29dof"), 0)):
+    for built, more in ((scene(), 0), (model, 2), (scene("t1_29dof"), 2)):  # two more: hands
         assert len(shapes_of(built, ())) == len(geoms(built)) == 18 + more
     kinds = {int(model.geom_type[g]) for g in geoms(model)}
     assert kinds == {int(k) for k in (2, 3, 5, 6)}  # sphere, capsule, cylinder, box
@@ -407,8 +407,7 @@ def test_the_hand_that_holds_the_paddle_hits_as_the_paddle_does(hand: tuple[str,
 
 def test_hands_are_named_by_body_or_geom() -> None:
     model = scene("t1_29dof")
-    hand = [shape.hand for shape in shapes_of(model, ("AR4", "left_forearm"))]
-    assert sum(hand) == 2
-    assert not any(shape.hand for shape in shapes_of(model, ("right_hand_link",)))  # nothing but the paddle collides
+    for names, count in ((("AR4", "left_forearm"), 2), (("right_hand_link",), 1), (("paddle",), 0), ((), 0)):
+        assert sum(shape.hand for shape in shapes_of(model, names)) == count
     with pytest.raises(ConfigError, match=r"robot\.paddle_hand: the robot has no body or geom third_hand"):
         shapes_of(model, ("AR4", "third_hand"))

@@ -234,6 +234,30 @@ def test_a_hit_is_seen_forecast_and_paid_in_its_step() -> None:
         assert not terms[name].any(), name
 
 
+def test_a_ball_on_the_trunk_is_lost_and_pays_for_no_hit() -> None:
+    env = make(2, "reset=evaluation", "randomization=none", "sensing=clean")
+    env.game.referee.own_bounces.fill_(1)
+    ball, base = env.worlds.ball, env.worlds.robot.base_position
+    ball.position.copy_(base + torch.tensor([0.25, 0.0, 0.1]))
+    ball.velocity.copy_(torch.tensor([-6.0, 0.0, 0.0]))
+    env.advance(torch.zeros(N, 21))
+    assert (env.worlds.ball.events.body == 1).all()
+    assert (ball.velocity[:, 0] > 3.0).all()
+    assert (env.game.referee.outcome == Outcome.BODY).all()
+    assert not env.game.target.something_to_hit.any()
+    aim_at_paddle(env)
+    for _ in range(2):
+        env.advance(torch.zeros(N, 21))
+        assert not env.game.referee.hit.any()
+        terms = dict(zip(env.rewards.names, env.rewards.values, strict=True))
+        for name in ("predicted_landing", "predicted_net_height", "success", "arrival", "contact", "paddle_to_target"):
+            assert not terms[name].any(), name
+    ball.position[:, 2] = 0.05
+    env.advance(torch.zeros(N, 21))
+    counts = env.pop_statistics()
+    assert (float(counts["serves"]), float(counts["outcome/body"]), float(counts["hits"])) == (N, N, 0)
+
+
 def test_the_flight_after_a_hit_ends_where_its_forecast_said() -> None:
     env = make(2, "reset=evaluation", "randomization=none", "serve=mixed")
     aim_at_paddle(env)
@@ -254,7 +278,9 @@ def test_the_flight_after_a_hit_ends_where_its_forecast_said() -> None:
             break
     on_table = hits & (env.game.returns.landing[:, 2] > 0.7) & (outcome >= 0)
     torch.testing.assert_close(touchdown[on_table], landing[on_table], atol=2e-3, rtol=0)
-    decided = hits & (outcome >= 0) & (outcome != Outcome.FALL) & (outcome != Outcome.DOUBLE_HIT)
+    decided = hits & (outcome >= 0)
+    for other in (Outcome.FALL, Outcome.DOUBLE_HIT, Outcome.BODY, Outcome.TABLE_TOUCH):  # not in the forecast
+        decided &= outcome != other
     assert torch.equal((outcome == Outcome.SUCCESS)[decided], lands_opponent[decided])
 
 

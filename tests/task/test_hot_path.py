@@ -18,7 +18,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from pace.predictor.network import PredictorNetwork
 from pace.task.env import TableTennisEnv
-from tests.helpers.emulation import take_the_gpus_way
+from tests.helpers.emulation import without_replay
 from tests.helpers.fakes import config
 
 N = 4
@@ -102,15 +102,15 @@ def test_a_wait_is_found(call: Any) -> None:
         call(NUMBERS)
 
 
-def test_neither_step_nor_reset_waits() -> None:
-    settings = config("engine=mjwarp", "randomization.push_interval=[0.02,0.04]")
+def test_neither_step_nor_reset_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+    without_replay(monkeypatch)
+    settings = config("engine=mjwarp", "engine.graph=dry", "randomization.push_interval=[0.02,0.04]")
     env = TableTennisEnv(settings, N, "cpu", 1, PredictorNetwork(settings.predictor))
     generator = torch.Generator().manual_seed(0)
     actions = 0.5 * torch.randn(5, N, 21, generator=generator)
     masks = torch.rand(5, N, generator=generator) < 0.5
     env.advance(actions[0])  # kernels are compiled, and tensors bound, at the first step
     env.reset_worlds(masks[0])
-    take_the_gpus_way(env)
     with no_waiting():
         for action, mask in zip(actions[1:].unbind(), masks[1:].unbind(), strict=True):
             env.advance(action)

@@ -48,7 +48,7 @@ def play(state: TaskState, distance: float, **times: Any) -> None:
 
 
 def test_every_term_of_the_paper_is_there_and_every_term_is_tested() -> None:
-    assert set(PACE.terms) | {"swing"} == set(TERMS)
+    assert set(PACE.terms) | {"swing", "ready_joints", "ready_height"} == set(TERMS)
     assert set(PACE.terms) - set(PAPER.terms) == {"arrival", "ready_stance", "return_velocity"}
 
 
@@ -351,6 +351,25 @@ def test_ready_stance_is_for_still_feet_at_the_idle_place_while_there_is_nothing
     assert value("ready_stance", state, PACE) == pytest.approx(math.exp(-0.15 / sigma))
     state.robot.base_position[:, 1] += PACE.terms["ready_stance"].params["reach"] + 0.01
     assert value("ready_stance", state, PACE) == 0.0
+
+
+def test_ready_joints_and_height_are_for_the_same_time_and_place() -> None:
+    terms = {
+        "ready_joints": RewardTerm(1.0, {"reach": 0.3, "sigma": 0.5}),
+        "ready_height": RewardTerm(-1.0, {"reach": 0.3, "height": 0.63}),
+    }
+    reward = replace(PACE, terms=PACE.terms | terms)
+    state = fake_state()
+    state.robot.base_position[:, 2] = 0.58
+    assert (value("ready_joints", state, reward), value("ready_height", state, reward)) == (0.0, 0.0)  # a ball to hit
+    state.ball.velocity[:, 0] = 1.0  # it moves away
+    state.robot.joint_velocity.fill_(-0.25)
+    assert value("ready_joints", state, reward) == pytest.approx(math.exp(-0.5))
+    assert value("ready_height", state, reward) == pytest.approx(0.05)
+    state.robot.base_position[:, 2] = 0.66
+    assert value("ready_height", state, reward) == 0.0
+    state.robot.base_position[:] += torch.tensor([0.0, 0.31, -0.1])
+    assert (value("ready_joints", state, reward), value("ready_height", state, reward)) == (0.0, 0.0)
 
 
 def test_power_of_all_joints_and_of_the_ankles() -> None:

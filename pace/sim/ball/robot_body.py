@@ -3,7 +3,8 @@
 A shape is a box with rounded edges, which is a sphere if its half sizes are zero and a capsule if two of them are, or a
 cylinder: for both the distance is a closed form. Between two instants of a control step a link's origin moves on a
 straight line and its rotation along the shortest way. That is off by a dt^2 / 8, a the acceleration and dt the time
-between the instants: within 2 mm at dt = 10 ms for a swinging forearm (``tests/sim/test_bodies.py``).
+between the instants. Measured on 16 robots of ``pretrained/campaign`` in 3 s of play, dt = 10 ms: 0.1 mm (median), 2 mm
+(largest, forearms), 4 mm (largest, feet that come down).
 """
 
 import warp as wp

@@ -7,7 +7,7 @@ from typing import Protocol, cast
 import mujoco
 import torch
 
-from pace.arrays.graph import graphs_wanted
+from pace.arrays.graph import Graphs, graphs_of
 from pace.config import plugins
 from pace.config.sim import EngineConfig
 from pace.devices import resolve_device
@@ -62,6 +62,6 @@ def make_engine(
     cannot use.
     """
     where = resolve_device(device)
-    graphs_wanted(engine, where)
-    name = engine.name if engine.name != "auto" else ("mjwarp" if where.type == "cuda" else "native")
+    a_gpus = where.type == "cuda" or graphs_of(engine, where) is Graphs.DRY
+    name = engine.name if engine.name != "auto" else ("mjwarp" if a_gpus else "native")
     return ENGINES[name](model, engine, num_worlds, where, substeps)

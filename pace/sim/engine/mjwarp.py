@@ -8,7 +8,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from pace.arrays.graph import CapturedCall, RecordedLaunches, graphs_wanted
+from pace.arrays.graph import CapturedCall, Graphs, RecordedLaunches, graphs_of
 from pace.arrays.launch import Launch
 from pace.arrays.streams import warp_scope
 from pace.config.sim import EngineConfig
@@ -67,12 +67,13 @@ class MjwarpEngine(StateTensors):
         self, model: mujoco.MjModel, engine: EngineConfig, num_worlds: int, device: torch.device, substeps: int
     ) -> None:
         super().__init__(model, num_worlds, device, substeps, engine.physics_dt)
+        graphs = graphs_of(engine, device)
         with warp_scope(device):
             self.model = mjw.put_model(model, batch_sizes=dict.fromkeys(ModelFields.NAMES, num_worlds))
             self.model.opt.warn_overflow = 0  # would print a line per world and step; overflowed() reports it instead
             # On a GPU all iterations are launched, and converged worlds skip theirs: a loop that ends on the device
             # would interrupt the capture around it, and torch would lose track of the graph's memory.
-            self.model.opt.graph_conditional = device.type == "cpu"
+            self.model.opt.graph_conditional = graphs is Graphs.NONE and device.type == "cpu"
             self.data = mjw.make_data(
                 model, num_worlds, nconmax=engine.contacts_per_world, njmax=engine.constraints_per_world
             )
@@ -86,8 +87,8 @@ class MjwarpEngine(StateTensors):
         self._targets = torch.zeros(num_worlds, substeps, model.nu, device=device)
         self._load = [self._load_targets(step) for step in range(substeps)]
         self._note = [self._record_state(instant) for instant in range(substeps + 1)]
-        if device.type == "cuda":
-            self._step = CapturedCall(self._play, device, graphs_wanted(engine, device))
+        if device.type == "cuda" or graphs is Graphs.DRY:
+            self._step = CapturedCall(self._play, device, graphs)
         else:
             self._step = RecordedLaunches(self._play, engine.graph != "never")
         self._qpos.copy_(self.qpos_path[:, 0])

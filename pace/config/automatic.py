@@ -1,0 +1,84 @@
+"""Values that the configuration leaves open: ``auto`` is chosen once, for the machine on which a run begins."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from omegaconf import DictConfig, OmegaConf
+
+from pace.config.base import config_dir, parse
+
+AUTO = "auto"
+SHARE_OF_MEMORY = 0.8  # of a GPU that a run may fill; the rest is for its driver, and for what else runs there
+#: Keys that may be ``auto``, and how their values are said.
+KEYS = {
+    "num_worlds": "{} worlds",
+    "algo.steps": "{} steps an update",
+    "algo.minibatches": "{} minibatches",
+    "algo.autocast": "number format {}",
+}
+
+
+@dataclass
+class DeviceValues:
+    """What ``auto`` stands for on one kind of device: ``configs/algo/_auto.yaml``."""
+
+    num_worlds: int  # for each device
+    steps: int
+    minibatches: int
+    memory: float  # GiB, of a run without worlds
+    memory_per_world: float  # GiB
+
+
+class Machine(NamedTuple):
+    """What ``auto`` depends on: ``kind`` of device, cpu or cuda; its memory in GiB; whether it has units for bf16
+    (None: not asked, and the number format stays open); ``count`` of such devices that train together."""
+
+    kind: str
+    memory: float = math.inf
+    bf16: bool | None = None
+    count: int = 1
+
+
+CPU = Machine("cpu")
+
+
+def choose(composed: DictConfig, machine: Machine) -> tuple[DictConfig, dict[str, Any]]:
+    """The configuration with values in place of ``auto``, and those that were chosen, by key."""
+    found = OmegaConf.create(OmegaConf.to_container(composed))
+    assert isinstance(found, DictConfig)
+    values = _values(machine)
+    chosen = {key: values[key] for key in KEYS if key in values and OmegaConf.select(found, key) == AUTO}
+    for key, value in chosen.items():
+        OmegaConf.update(found, key, value)
+    return found, chosen
+
+
+def in_words(chosen: dict[str, Any]) -> str:
+    """The chosen values in one line."""
+    return ", ".join(KEYS[key].format(value) for key, value in chosen.items())
+
+
+def left_open(composed: DictConfig) -> set[str]:
+    """The keys that are ``auto``."""
+    return {key for key in KEYS if OmegaConf.select(composed, key) == AUTO}
+
+
+def _values(machine: Machine) -> dict[str, Any]:
+    table = OmegaConf.load(config_dir() / "algo" / "_auto.yaml")
+    given = parse(OmegaConf.select(table, machine.kind), DeviceValues)
+    worlds = _worlds_that_fit(given, machine.memory) * machine.count
+    values: dict[str, Any] = {"num_worlds": worlds, "algo.steps": given.steps, "algo.minibatches": given.minibatches}
+    if machine.bf16 is not None:
+        values["algo.autocast"] = "mixed" if machine.bf16 else "fp32"
+    return values
+
+
+def _worlds_that_fit(given: DeviceValues, memory: float) -> int:
+    """The number of worlds, halved until a run of them fits into the memory."""
+    worlds = given.num_worlds
+    while worlds > 1 and given.memory + worlds * given.memory_per_world > SHARE_OF_MEMORY * memory:
+        worlds //= 2
+    return worlds

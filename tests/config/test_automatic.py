@@ -1,0 +1,97 @@
+"""``auto`` in the configuration: chosen for the machine, said in a line, saved as chosen, and never chosen again."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from pace.config.automatic import CPU, KEYS, Machine, choose, in_words, left_open
+from pace.config.base import compose, parse
+from pace.config.training import TrainConfig, load_train_config
+from pace.rl import session
+from pace.rl.agent import compute_dtype
+from pace.rl.train import main
+from pace.runs.checkpoint import load_checkpoint
+
+
+def chosen(machine: Machine, *overrides: str) -> tuple[TrainConfig, dict[str, Any]]:
+    composed, values = choose(compose("train", list(overrides)), machine)
+    return parse(composed, TrainConfig), values
+
+
+def test_a_big_gpu_gets_what_was_measured() -> None:
+    config, values = chosen(Machine("cuda", 139.8, True))
+    assert (config.num_worlds, config.algo.steps, config.algo.minibatches) == (8192, 4, 4)
+    assert config.algo.autocast == "mixed"
+    assert set(values) == set(KEYS)
+    assert in_words(values) == "8192 worlds, 4 steps an update, 4 minibatches, number format mixed"
+
+
+@pytest.mark.parametrize(("memory", "worlds"), [(24.0, 8192), (8.0, 8192), (6.0, 4096), (4.0, 2048), (0.1, 1)])
+def test_a_small_card_gets_as_many_worlds_as_fit(memory: float, worlds: int) -> None:
+    """2 GiB and 0.5 MiB (0.5e-3 GiB) a world, in 80 % of the memory."""
+    assert chosen(Machine("cuda", memory, False))[0].num_worlds == worlds
+
+
+def test_several_gpus_get_as_many_worlds_each() -> None:
+    assert chosen(Machine("cuda", 80.0, True, count=4))[0].num_worlds == 4 * 8192
+
+
+def test_what_is_given_stays() -> None:
+    given = ("num_worlds=64", "algo.steps=6", "algo.autocast=bf16")
+    config, values = chosen(Machine("cuda", 80.0, True), *given)
+    assert (config.num_worlds, config.algo.steps, config.algo.autocast) == (64, 6, "bf16")
+    assert values == {"algo.minibatches": 4}
+    assert left_open(compose("train", list(given))) == {"algo.minibatches"}
+    paper, values = chosen(Machine("cuda", 80.0, True), "experiment=paper")
+    assert (paper.num_worlds, paper.algo.steps, paper.algo.minibatches) == (4096, 24, 4)
+    assert values == {"algo.autocast": "mixed"}
+
+
+def test_without_a_machine_the_values_are_those_of_a_cpu() -> None:
+    config = load_train_config()
+    assert (config.num_worlds, config.algo.steps, config.algo.minibatches) == (1024, 4, 4)
+    assert config.algo.autocast == "auto"  # the hardware decides when a run begins
+    assert chosen(CPU._replace(bf16=False))[0].algo.autocast == "fp32"
+
+
+def test_mixed_is_bf16_on_any_hardware(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)
+    formats = {name: compute_dtype(name, torch.device("cpu")) for name in ("auto", "mixed", "bf16", "fp32")}
+    assert formats == dict.fromkeys(("mixed", "bf16"), torch.bfloat16) | dict.fromkeys(("auto", "fp32"), torch.float32)
+
+
+SMALL = ("algo.actor_hidden=[8]", "algo.critic_hidden=[8]", "predictor.batches_per_update=2", "progress=false")
+
+
+@pytest.mark.slow
+def test_a_run_says_and_saves_what_it_has_chosen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def train(*arguments: str) -> str:
+        monkeypatch.setattr(sys, "argv", ["train", *arguments])
+        assert main() == 0
+        return capsys.readouterr().out
+
+    monkeypatch.setattr(session, "machine_of", lambda *_: Machine("cuda", 1.0, True))
+    said = train(f"out={tmp_path}", "samples=64", "device=cpu", "processes=1", "num_worlds=16", *SMALL)
+    assert "for this device: 4 steps an update, 4 minibatches, number format mixed\n" in said
+    algo = load_checkpoint(tmp_path).config["algo"]
+    assert (algo["steps"], algo["minibatches"], algo["autocast"]) == (4, 4, "mixed")
+    monkeypatch.setattr(session, "machine_of", lambda *_: pytest.fail("a resumed run keeps its values"))
+    assert "for this device" not in train(f"resume={tmp_path}", "samples=128", "progress=false")
+    assert load_checkpoint(tmp_path).config["algo"]["autocast"] == "mixed"
+
+
+def test_a_run_of_a_gpu_that_goes_on_without_bf16_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    config, saved = chosen(Machine("cuda", 80.0, True))[0], object()
+    monkeypatch.setattr(session, "device_type_of", lambda _: "cuda")
+    for supported, number_format in ((True, "mixed"), (False, "fp32")):
+        monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda value=supported: value)
+        changed = session.adapt(config, saved, torch.device("cpu"), [])  # type: ignore[arg-type]
+        assert config.algo.autocast == number_format
+        assert changed == ({} if supported else {"algo.autocast": "fp32"})
