@@ -24,7 +24,7 @@ class Update:
     """Rolls out, fits the predictor and lets the algorithm learn, together with the other processes of the ``group``.
 
     An algorithm that is :class:`InPlace` waits for the device once, at the end: the metrics, all checks and the counts
-    of the task are one message. A fault is found only then, and the weights are no longer good: whoever calls has a copy
+    of the task are one message. A fault is found only then, and the weights are no longer good: the caller has a copy
     of those before (:class:`pace.rl.recovery.Recovery`).
 
     Args: networks: all that are trained.
