@@ -192,7 +192,8 @@ class _Workers:
         self._logs: dict[int, IO[str]] = {}
         self._started: dict[int, subprocess.Popen[str]] = {}
         for rank in range(1, size):
-            log = self._open.enter_context(tempfile.TemporaryFile("w+"))  # noqa: SIM115  # the stack closes it
+            unnamed = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")  # noqa: SIM115  # the stack closes it
+            log = self._open.enter_context(unnamed)
             self._logs[rank] = log
             environment = {MEMBERSHIP: f"{rank} {size} {port}", "OMP_NUM_THREADS": str(threads)}
             self._started[rank] = _start(arguments, log, environment)

@@ -140,7 +140,7 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 def write_serves(path: Path, rows: Sequence[Row]) -> None:
     """Every counted serve, one per line: its range, then ``COLUMNS``."""
-    with path.open("w", newline="") as file:
+    with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(("serve", *COLUMNS))
         for row in rows:
@@ -164,7 +164,7 @@ def write_report(
     write_json(files[0], content | more(rows, first_ball))
     write_csv(files[1], summaries)
     title = f"# Evaluation of {context['policy']}\n\n{describe(context)}\n"
-    files[2].write_text(f"{title}\n{tables(rows, paper, markdown=True, first_ball=first_ball)}\n")
+    write_whole(files[2], f"{title}\n{tables(rows, paper, markdown=True, first_ball=first_ball)}\n")
     write_serves(files[3], rows)
     return files
 

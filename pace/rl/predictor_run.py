@@ -107,7 +107,7 @@ def train_predictor(composed: DictConfig) -> None:
     folder = run.save(int(counters["updates"]), Checkpoint(to_dict(config), counters, weights, None), last=True)
     run.close()
     result = {"errors": errors, "counters": counters, "ball": config.ball.name, "serve": config.serve.name}
-    (run.path / RESULT).write_text(json.dumps(result, indent=1))
+    (run.path / RESULT).write_text(json.dumps(result, indent=1), encoding="utf-8")
     for name, value in errors.items():
         print(f"{name}: {value:.2f}")
     for file in (folder, run.path / RESULT, run.path / METRICS):

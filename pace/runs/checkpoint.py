@@ -101,7 +101,7 @@ def _write(folder: Path, checkpoint: Checkpoint) -> None:
         meta["training"] = flatten_tensors(checkpoint.training, "", training)
         save_file(training, folder / TRAINING)
     save_file(weights, folder / WEIGHTS)
-    (folder / META).write_text(json.dumps(meta, indent=1))
+    (folder / META).write_text(json.dumps(meta, indent=1), encoding="utf-8")
     readers = (folder / META).stat().st_mode & 0o777  # safetensors closes its files to everybody else
     for file in folder.iterdir():
         file.chmod(readers)
@@ -181,7 +181,7 @@ def read_meta(folder: Path) -> dict[str, Any]:
     """
     file = folder / META
     try:
-        meta = json.loads(file.read_text())
+        meta = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:  # no text, no JSON, numbers or depths that make no sense
         raise CheckpointError(f"{file} cannot be read: {error}") from error
     if not isinstance(meta, dict) or "format" not in meta:

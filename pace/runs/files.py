@@ -33,12 +33,14 @@ def reason(error: Exception) -> str:
 def write_whole(file: Path, content: str | bytes) -> None:
     """Write ``file``, or leave what is there: the new content replaces it when it is on the disk.
 
+    Text is UTF-8. Names of files in it that the locale cannot read are written byte by byte, as the disk has them.
+
     Errors: ``OSError``.
     """
     temporary = file.with_name(f".{file.name}.{os.getpid()}.tmp")
     try:
         with temporary.open("wb") as handle:
-            handle.write(content.encode() if isinstance(content, str) else content)
+            handle.write(content.encode(errors="surrogateescape") if isinstance(content, str) else content)
             handle.flush()
             os.fsync(handle.fileno())
         temporary.replace(file)

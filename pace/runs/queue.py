@@ -167,7 +167,7 @@ class Job:
     def failure(self) -> str | None:
         """Why the run is not finished, once its process has ended; None if it is."""
         if self.process.returncode != 0:
-            lines = self.run.log.read_text(errors="replace").strip().splitlines()
+            lines = self.run.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
             return f"status {self.process.returncode}: {lines[-1] if lines else 'it printed nothing'}"
         return None if self.run.finished else f"ended at {self.run.saved_samples():,} control steps"
 

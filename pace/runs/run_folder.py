@@ -272,7 +272,7 @@ def _keys(file: Path) -> list[str]:
 def _first_line(file: Path) -> str:
     """The first line of a text file; nothing if it is no text."""
     try:
-        with file.open() as text:
+        with file.open(encoding="utf-8") as text:
             return text.readline()
     except (OSError, UnicodeDecodeError):
         return ""

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import zipfile
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -119,6 +120,7 @@ class Bomb:
         return exec, ("open('ran', 'w').close()",)
 
 
+@cache
 def zip_bomb() -> bytes:
     """A GiB of zeros in a MiB."""
     packed = io.BytesIO()
@@ -190,6 +192,7 @@ def test_hostile_descriptions(text: str, original: dict[str, bytes], tmp_path: P
         load_policy(folder)
 
 
+@pytest.mark.long
 def test_a_training_does_not_start_from_hostile_weights(original: dict[str, bytes], tmp_path: Path) -> None:
     """The commands, too, end in one line."""
     write(tmp_path, original | {WEIGHTS: pickle.dumps(Bomb())})

@@ -77,6 +77,7 @@ def test_a_number_within_its_range_plays_or_is_one_line(count: int) -> None:
             assert_one_line(error)
             return
         generator = torch.Generator().manual_seed(0)
+        env.reset_worlds(torch.ones(2, dtype=torch.bool))
         for _ in range(4):
             env.advance(torch.randn(2, 21, generator=generator))
             env.reset_worlds(env.terminated | env.truncated)
