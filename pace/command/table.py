@@ -87,7 +87,7 @@ COMMANDS = {
         failures=(
             CHECKPOINT_ERROR,
             "pace.sim.render:RenderError",
-            "pace.viewer.web:PageError",
+            "pace.viewer.server:PageError",
             "pace.sim.replay:ReplayError",
         ),
         extra="viewer",

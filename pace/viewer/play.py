@@ -16,8 +16,9 @@ from pace.runs.progress import SECONDS_PER_LINE
 from pace.runs.run_folder import REPLAY_SUFFIX
 from pace.viewer.playback import Show
 from pace.viewer.replay import ReplayPage, load_show
+from pace.viewer.server import require_viewer
 from pace.viewer.video import Shown, write_video
-from pace.viewer.web import Page, require_port, require_viewer
+from pace.viewer.web import Page
 
 
 def play_from_config(composed: DictConfig) -> None:
@@ -55,7 +56,6 @@ def replay(config: PlayConfig) -> None:
         film(config, show, f"replay {config.run}")
         return
     require_viewer()
-    require_port(config.host, config.port)
     shown = ReplayPage(show, config.host, config.port)
     print(f"replay {config.run}\nopen {shown.url} in a browser; Ctrl-C ends it", flush=True)
     try:

@@ -14,7 +14,8 @@ from pace.config.training import TrainConfig
 from pace.sim.replay import Replay, ReplayError, WorldReplay, load_replay
 from pace.sim.robot_spec import RobotSpec
 from pace.viewer.playback import Snapshot
-from pace.viewer.scene import BrowserScene, open_server
+from pace.viewer.scene import BrowserScene
+from pace.viewer.server import number, open_server
 
 FRAME = 1.0 / 30.0  # s between pictures
 PAUSE = 0.5  # s on the last state, before the next world
@@ -91,14 +92,14 @@ def load_show(file: Path) -> ReplayShow:
 
 
 class ReplayPage:
-    """A replay in all connected browsers. The port must be free: see :func:`pace.viewer.web.require_port`.
+    """A replay in all connected browsers.
 
-    Attributes: ``url``.
+    Attributes: ``url``. Errors: :class:`pace.viewer.server.PageError` for a port that cannot be opened.
     """
 
     def __init__(self, show: ReplayShow, host: str, port: int) -> None:
-        self.show, self.server = show, open_server(host, port)
-        self.url = f"http://{host}:{self.server.get_port()}"
+        self.show = show
+        self.server, self.url = open_server(host, port)
         self._scene = BrowserScene(self.server, show.config)
         gui = self.server.gui
         gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
@@ -116,9 +117,9 @@ class ReplayPage:
         try:
             while not ended():
                 asked, self._asked = self._asked, None
-                if asked is not None:
+                if asked in self.show.names:  # a browser may send anything
                     self.show.choose(asked)
-                self._scene.draw(self.show.advance(FRAME * self._speed.value))
+                self._scene.draw(self.show.advance(FRAME * number(self._speed, SPEED)))
                 if self._text.content != self.show.text():
                     self._text.content = self.show.text()
                 time.sleep(FRAME)

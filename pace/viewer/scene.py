@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import redirect_stdout
-from io import StringIO
 from typing import Any
 
 import mujoco
@@ -25,14 +23,6 @@ from pace.viewer.playback import (
 )
 
 CAMERA, LOOK_AT = (-2.9, -2.6, 1.7), (-0.7, 0.0, 0.8)  # m, the first view
-
-
-def open_server(host: str, port: int) -> Any:
-    """A viser server that listens there, or at another port if that was taken meanwhile."""
-    import viser
-
-    with redirect_stdout(StringIO()):  # hides its banner
-        return viser.ViserServer(host=host, port=port, label="PACE", verbose=False)
 
 
 class BrowserScene:

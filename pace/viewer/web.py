@@ -6,18 +6,18 @@ out and draws.
 
 from __future__ import annotations
 
-import socket
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from queue import Empty, SimpleQueue
 
-from pace.config.base import ConfigError
+from pace.config.base import ConfigError, printable
 from pace.rl.policies import TaskPolicy, load_policy
 from pace.runs.checkpoint import CheckpointError
 from pace.runs.checkpoint_folders import FOLDER, list_checkpoints
 from pace.viewer.playback import Serve, Show, Snapshot
-from pace.viewer.scene import BrowserScene, open_server
+from pace.viewer.scene import BrowserScene
+from pace.viewer.server import number, open_server, require_port, require_viewer
 
 FRAME = 1.0 / 30.0  # s between pictures
 LONGEST_FRAME = 0.1  # s: a page does not catch up after a longer delay
@@ -37,30 +37,6 @@ LEGEND = (
 )
 
 
-class PageError(RuntimeError):
-    """A page that cannot be shown; the message says why."""
-
-
-def require_viewer() -> None:
-    """Errors: :class:`PageError` if the packages of the page are missing."""
-    try:
-        import mjviser
-    except ImportError as error:
-        raise PageError(f"{error}: pip install 'pace-table-tennis[viewer]'") from error
-    del mjviser
-
-
-def require_port(host: str, port: int) -> None:
-    """Errors: :class:`PageError` if ``port`` of ``host`` is in use or may not be opened."""
-    try:
-        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
-        socket.create_server((host, port), family=family).close()
-    except (OSError, OverflowError) as error:
-        raise PageError(
-            f"port {port} of {host} cannot be opened ({error}): give another port=, or end what uses it"
-        ) from error
-
-
 def checkpoints_of(policy: TaskPolicy) -> list[Path]:
     """All checkpoints of the run that ``policy`` comes from, newest last; at least its own."""
     own = Path(policy.source)
@@ -76,11 +52,11 @@ class Page:
         policy: as :func:`pace.rl.load_policy` gives it.
         overrides: of the saved task.
         balls: names of ball presets to choose from.
-        host, port: to listen on. With another host than the local one, everybody in its network has the controls.
+        host, port: to listen on. With another host than the local one, who has the token in ``url`` has the controls.
         speed: of time, 1 for real time.
         seed: of all random numbers.
 
-    Errors: :class:`PageError`; :class:`pace.config.ConfigError` for wrong overrides.
+    Errors: :class:`pace.viewer.server.PageError`; :class:`pace.config.ConfigError` for wrong overrides.
     """
 
     def __init__(
@@ -96,15 +72,12 @@ class Page:
         require_viewer()
         require_port(host, port)
         self._overrides, self._seed = list(overrides), seed
+        self._balls = tuple(balls)
         self._ball: str | None = None  # that of the overrides, or of the saved task
         self._policy = policy
         self._requests: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self.show = Show(policy, overrides, seed)
-        self.server = open_server(host, port)
-        if self.server.get_port() != port:  # another process took it first
-            self.server.stop()
-            raise PageError(f"port {port} of {host} was taken just now: give another port=")
-        self.url = f"http://{host}:{port}"
+        self.server, self.url = open_server(host, port)
         self._scene = BrowserScene(self.server, self.show.config)
         self._build_controls(balls, speed)
         self._next_look = 0.0
@@ -155,7 +128,10 @@ class Page:
     @property
     def serve(self) -> Serve | None:
         """The serve of the sliders, or ``None`` for random serves."""
-        return None if self._random.value else Serve(*(float(slider.value) for slider in self._sliders))
+        if self._random.value:
+            return None
+        starts = (slider[4] for slider in SERVE_SLIDERS)
+        return Serve(*(number(*each) for each in zip(self._sliders, starts, strict=True)))
 
     def _ask(self, request: Callable[[], None]) -> None:
         self._requests.put(request)
@@ -170,11 +146,18 @@ class Page:
     def _names(self) -> tuple[str, ...]:
         return tuple(folder.name for folder in reversed(checkpoints_of(self._policy)))
 
-    def _change_ball(self, name: str) -> None:
-        self._restart(self._policy, name)
+    def _change_ball(self, name: object) -> None:
+        if name in self._balls:
+            self._restart(self._policy, str(name))
+        else:
+            self._refuse(name)
 
-    def _change_checkpoint(self, name: str) -> None:
+    def _change_checkpoint(self, name: object) -> None:
+        """Only a name that the page itself has listed: a browser may send any path."""
         if name == Path(self._policy.source).name:
+            return
+        if not isinstance(name, str) or name not in self._names():
+            self._refuse(name)
             return
         try:
             policy = load_policy(Path(self._policy.source).with_name(name))
@@ -182,6 +165,9 @@ class Page:
             self._status.content = f"**{error}**"
             return
         self._restart(policy, self._ball)
+
+    def _refuse(self, name: object) -> None:
+        self._status.content = f"**{printable(str(name)[:40])} does not exist**"
 
     def _restart(self, policy: TaskPolicy, ball: str | None) -> None:
         """Start a new show, with a new score, for another policy or another ball."""
@@ -225,6 +211,6 @@ class Page:
                 break
         self._look_for_checkpoints()
         if self.server.get_clients():
-            self.draw(self.show.advance(elapsed * self._time.value))
+            self.draw(self.show.advance(elapsed * number(self._time, 1.0)))
         else:
             time.sleep(IDLE)

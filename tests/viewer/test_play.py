@@ -182,7 +182,7 @@ def test_bad_input_is_one_line(
 
 
 def test_missing_packages_are_named(monkeypatch: pytest.MonkeyPatch, policy: TaskPolicy, tmp_path: Path) -> None:
-    from pace.viewer.web import PageError, require_viewer
+    from pace.viewer.server import PageError, require_viewer
 
     monkeypatch.setitem(sys.modules, "mjviser", None)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
@@ -252,7 +252,8 @@ def test_the_page_in_a_browser(page: tuple, port: int, tmp_path: Path) -> None:
 
 def test_controls_of_the_page(policy: TaskPolicy, port: int) -> None:
     pytest.importorskip("mjviser")
-    from pace.viewer.web import Page, PageError, checkpoints_of
+    from pace.viewer.server import PageError
+    from pace.viewer.web import Page, checkpoints_of
 
     shown = Page(policy, QUICK, ["paper", "rubber"], port=port)
     try:
