@@ -51,3 +51,10 @@ def assert_one_line(error: BaseException) -> None:
     assert text.strip()
     assert "\n" not in text
     assert len(text) < 2000
+
+
+def any_vectors() -> Any:
+    """Three numbers of float32: ordinary ones of a table's size, others of every size, and what is no number."""
+    ends = [0.0, -0.0, 1e-40, 1e19, -1e30, 3e38, float("inf"), float("-inf"), float("nan")]
+    each = st.one_of(st.sampled_from(ends), st.floats(-20.0, 20.0), st.floats(width=32))
+    return st.lists(each, min_size=3, max_size=3)
