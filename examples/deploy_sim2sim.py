@@ -292,7 +292,7 @@ def build_model(scene: Path, meta: Mapping[str, Any]) -> mujoco.MjModel:
     """
     robot = meta["config"]["robot"]["model"]  # in the folder of the scene, or a path
     file = scene.parent / robot if (scene.parent / robot).exists() else Path(robot)
-    spec = mujoco.MjSpec.from_string(scene.read_text(), include={"robot.xml": file.read_bytes()})
+    spec = mujoco.MjSpec.from_string(scene.read_text(encoding="utf-8"), include={"robot.xml": file.read_bytes()})
     speeds, stalls = (meta.get(key) or [None] * len(meta["joint_names"]) for key in ("max_speed", "stall_torque"))
     motors = zip(meta["joint_names"], meta["kp"], meta["kd"], meta["effort"], speeds, stalls, strict=True)
     for name, kp, kd, effort, speed, stall in motors:

@@ -43,8 +43,8 @@ def threads_of(size: int) -> int:
 def quota(process: Path = PROCESS) -> float | None:
     """Processor seconds per second that the control groups of this process grant; None: no limit, or not known."""
     try:
-        mounts = (process / "mountinfo").read_text()
-        groups = (process / "cgroup").read_text()
+        mounts = (process / "mountinfo").read_text(encoding="utf-8")
+        groups = (process / "cgroup").read_text(encoding="utf-8")
     except OSError:
         return None
     found = [share for tree in _hierarchies(mounts) for share in _shares(tree, _group(tree.version, groups))]
@@ -93,9 +93,11 @@ def _share(version: int, group: Path) -> float | None:
     """The limit of one group, in cores."""
     try:
         if version == 2:
-            granted, period = (group / "cpu.max").read_text().split()
+            granted, period = (group / "cpu.max").read_text(encoding="utf-8").split()
         else:
-            granted, period = ((group / f"cpu.cfs_{name}_us").read_text().strip() for name in ("quota", "period"))
+            granted, period = (
+                (group / f"cpu.cfs_{name}_us").read_text(encoding="utf-8").strip() for name in ("quota", "period")
+            )
         return None if granted in ("max", "-1") else float(granted) / float(period)
     except (OSError, ValueError, ZeroDivisionError):
         return None  # no such file: the controller is not switched on here

@@ -197,7 +197,8 @@ class _Workers:
         self._logs: dict[int, IO[str]] = {}
         self._started: dict[int, subprocess.Popen[str]] = {}
         for rank in range(1, size):
-            log = self._open.enter_context(tempfile.TemporaryFile("w+"))  # noqa: SIM115  # the stack closes it
+            unnamed = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")  # noqa: SIM115  # the stack closes it
+            log = self._open.enter_context(unnamed)
             self._logs[rank] = log
             environment = {MEMBERSHIP: f"{rank} {size} {port}", "OMP_NUM_THREADS": str(threads)}
             self._started[rank] = _start(arguments, log, environment)
@@ -206,13 +207,21 @@ class _Workers:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        for process in self._started.values():
+        for rank, process in self._started.items():
             try:
-                process.wait(SECONDS_TO_END if kind is None else 0)
+                status = process.wait(SECONDS_TO_END if kind is None else 0)
             except subprocess.TimeoutExpired:
                 process.kill()
-                process.wait()
+                status = process.wait()
+            if kind is None and status != 0:  # the work is done, and saved
+                print(f"warning: {self._ended(rank, status)}", file=sys.stderr)
         self._open.close()
+
+    def _ended(self, rank: int, status: int) -> str:
+        """How a worker has ended, and the end of its output."""
+        self._logs[rank].seek(0)
+        tail = "\n".join(self._logs[rank].read().splitlines()[-TAIL_LINES:])
+        return f"process {rank} of {len(self._started) + 1} ended with status {status}:\n{tail}"
 
     def wait_for(self, store: dist.Store) -> None:
         """Return when all have connected to ``store``."""
@@ -236,11 +245,9 @@ class _Workers:
         deadline = time.monotonic() + patience
         while True:
             for rank, process in self._started.items():
-                if process.poll() is not None:
-                    self._logs[rank].seek(0)
-                    tail = "\n".join(self._logs[rank].read().splitlines()[-TAIL_LINES:])
-                    status = f"process {rank} of {len(self._started) + 1} ended with status {process.returncode}"
-                    raise ProcessGroupError(f"{status}:\n{tail}") from cause
+                status = process.poll()
+                if status is not None:
+                    raise ProcessGroupError(self._ended(rank, status)) from cause
             if time.monotonic() >= deadline:
                 return
             time.sleep(POLL_SECONDS)
@@ -248,7 +255,9 @@ class _Workers:
 
 def _end_with_rank_0() -> None:
     """In a worker: wait until rank 0 ends, for whatever reason, and end too."""
-    sys.stdin.buffer.read()  # rank 0 writes nothing; its end of the pipe closes when it ends
+    # rank 0 writes nothing; its end of the pipe closes when it ends. Not sys.stdin: at the end of a worker's own work
+    # Python would find the lock of that file taken, and abort
+    os.read(0, 1)
     os._exit(RANK_0_IS_GONE)
 
 

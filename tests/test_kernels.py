@@ -14,7 +14,7 @@ import pace
 from pace.task.env import make_env
 
 ROOT = Path(pace.__file__).parent
-ARCHITECTURES = (80, 90)  # A100, H100
+ARCHITECTURES = (80, 90, 100)  # A100, H100, B200
 pytestmark = [
     pytest.mark.long,
     pytest.mark.skipif(sys.platform == "darwin", reason="Warp has no CUDA compiler there"),

@@ -11,8 +11,8 @@ import pace
 
 TESTS = Path(__file__).parent
 ROOM = Path(pace.__file__).parent
-#: Folders that are no rooms: what all tests share, and extensions of several rooms from outside.
-OTHERS = {"gpu", "helpers", "seams"}
+#: Folders that are no rooms: what all tests share, extensions of several rooms from outside, and what needs a GPU.
+OTHERS = {"helpers", "seams", "gpu"}
 
 
 def files() -> list[Path]:

@@ -84,7 +84,7 @@ def machine(device: torch.device) -> dict[str, Any]:
 def _cpu_name() -> str:
     info = Path("/proc/cpuinfo")
     if info.exists():
-        for line in info.read_text().splitlines():
+        for line in info.read_text(encoding="utf-8").splitlines():
             if line.startswith("model name"):
                 return line.split(":", 1)[1].strip()
     return platform.processor() or platform.machine()
@@ -93,4 +93,4 @@ def _cpu_name() -> str:
 def write(path: Path, figures: dict[str, float | None], context: dict[str, Any]) -> None:
     """``bench.json``: the figures by name, their ratios, and the circumstances."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({**figures, "ratios": ratios(figures), **context}, indent=1) + "\n")
+    path.write_text(json.dumps({**figures, "ratios": ratios(figures), **context}, indent=1) + "\n", encoding="utf-8")

@@ -67,13 +67,13 @@ def training_run(num_worlds: int, updates: int, overrides: list[str]) -> tuple[f
 
 def _peak_mib(command: list[str], output: Path) -> float:
     peak = 0.0
-    with output.open("w") as file:
+    with output.open("w", encoding="utf-8") as file:
         process = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT)
         while process.poll() is None:
             peak = max(peak, sum(_resident_peak_mib(pid) for pid in _family(process.pid)))
             time.sleep(POLL_SECONDS)
     if process.returncode != 0:
-        tail = "\n".join(output.read_text().splitlines()[-15:])
+        tail = "\n".join(output.read_text(encoding="utf-8").splitlines()[-15:])
         raise BenchError(f"{' '.join(command)} ended with status {process.returncode}:\n{tail}")
     return peak
 
@@ -81,7 +81,7 @@ def _peak_mib(command: list[str], output: Path) -> float:
 def _family(pid: int) -> list[int]:
     """A process and those that it started, such as the workers of a training run."""
     try:
-        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+        children = Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="utf-8").split()
     except FileNotFoundError:  # it has just ended, or there is no /proc, which the caller reports
         children = []
     return [pid, *(descendant for child in children for descendant in _family(int(child)))]
@@ -93,7 +93,7 @@ def _resident_peak_mib(pid: int) -> float:
     Linux counts the parent's own peak into a child's ``ru_maxrss`` (it is kept over exec), so that cannot be used.
     """
     try:
-        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+        lines = Path(f"/proc/{pid}/status").read_text(encoding="utf-8").splitlines()
     except FileNotFoundError:
         if not Path("/proc/self/status").exists():
             raise BenchError("peak memory is read from /proc: leave train and memory out of bench.parts") from None
@@ -103,7 +103,7 @@ def _resident_peak_mib(pid: int) -> float:
 
 def steady_rate(metrics: Path) -> float:
     """Control steps a second in a run's metrics after its first updates; NaN if there are no more."""
-    with metrics.open(newline="") as file:
+    with metrics.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     if len(rows) <= WARM_UP_ROWS:
         return float("nan")

@@ -5,6 +5,6 @@ The common code of all commands belongs here, not the work of one command. Impor
 """
 
 from pace.command.arguments import quote
-from pace.command.run import run_command
+from pace.command.run import Terminated, run_command
 
-__all__ = ["quote", "run_command"]
+__all__ = ["Terminated", "quote", "run_command"]

@@ -14,6 +14,9 @@ from pace.config.names import check_renamed, split_override
 #: Options of Hydra whose value is the next argument.
 HYDRA_OPTIONS = ("--cfg", "-c", "--info", "-i", "--package", "-p", "--config-name", "-cn", "--config-dir", "-cd")
 
+#: Keys whose value is a path, of any command.
+PATHS = ("out", "run", "resume", "init_from", "predictor_from", "video", "evaluation", "notes", "figure")
+
 #: Tables of the configuration with keys of the users' own.
 OPEN_TABLES = ("reward.terms.", "observation.estimates.")
 
@@ -31,6 +34,8 @@ def prepare(name: str, arguments: Sequence[str]) -> list[str]:
     if command.rest:
         given = name_list(given, command.rest)
     check_renamed(plain_overrides(given))
+    if not {"-m", "--multirun"} & set(given):  # there a comma separates values
+        given = [quote_path(argument) for argument in given]
     given = [_open(argument) for argument in given]
     check_keys(name, command, given)
     if command.collected:
@@ -111,12 +116,19 @@ def name_list(arguments: list[str], key: str) -> list[str]:
 
 def quote(value: str) -> str:
     """``value`` quoted for Hydra, such as a path with a ``=`` in it."""
-    escaped = value.replace("\\", "\\\\").replace("'", "\\'")
-    return f"'{escaped}'"
+    doubled = re.sub(r"(\\+)(?='|$)", r"\1\1", value)  # elsewhere Hydra takes them as they are
+    return "'" + doubled.replace("'", "\\'") + "'"
+
+
+def quote_path(argument: str) -> str:
+    """``out=my runs/ü 1`` and ``out=1e3`` as text for Hydra, character by character. What is quoted stays so."""
+    key, equals, value = argument.partition("=")
+    ready = value in ("", "null") or value.startswith(("'", '"')) or "${" in value
+    return f"{key}={quote(value)}" if equals and key in PATHS and not ready else argument
 
 
 def _text(value: str) -> str:
-    return value if re.fullmatch(r"[\w./-]+", value) else quote(value)
+    return value if re.fullmatch(r"[\w./-]+", value, re.ASCII) else quote(value)
 
 
 def plain_overrides(arguments: Sequence[str]) -> list[str]:

@@ -95,7 +95,7 @@ def default_choices(command: Command) -> Mapping[str, str]:
     return {
         match[1]: match[2]
         for file in files
-        for match in re.finditer(r"^  - (?:override /)?(\w+): (\w+)", file.read_text(), re.MULTILINE)
+        for match in re.finditer(r"^  - (?:override /)?(\w+): (\w+)", file.read_text(encoding="utf-8"), re.MULTILINE)
     }
 
 

@@ -31,7 +31,7 @@ def file_keys(file: Path) -> dict[str, Key]:
     A comment belongs to the key in its line, or to the next key if it stands above that, at its indentation. The
     comment of a key that only holds others goes to the first of those.
     """
-    text = file.read_text()
+    text = file.read_text(encoding="utf-8")
     found: dict[str, Key] = {}
     parts = re.search(r"^defaults: \[([\w, ]+)\]", text, re.MULTILINE)
     for part in parts[1].split(",") if parts else ():
@@ -53,7 +53,9 @@ def file_keys(file: Path) -> dict[str, Key]:
 
 def heading(file: Path) -> str:
     """The comment at the top of ``file``, on the whole file."""
-    return " ".join(line.lstrip("# ") for line in _head(file.read_text()) if not line.startswith("# @package"))
+    return " ".join(
+        line.lstrip("# ") for line in _head(file.read_text(encoding="utf-8")) if not line.startswith("# @package")
+    )
 
 
 def _head(text: str) -> list[str]:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import sys
 from collections.abc import Sequence
+from io import TextIOWrapper
 from pathlib import Path
 from pkgutil import resolve_name
 
@@ -23,9 +25,16 @@ from pace.config.base import ConfigError, also_from, compose, config_dir, meant
 from pace.config.names import check_choice, split_override
 from pace.cores import core_set, usable_cores
 
+#: Errors of a disk and of permissions, which are no fault of the program.
+DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EACCES, errno.EPERM, errno.EIO)
 EXIT_USAGE = 2
 EXIT_FAILED = 1
 EXIT_INTERRUPTED = 130
+EXIT_TERMINATED = 75  # EX_TEMPFAIL: the work was saved, and the same command, or resume=, continues it
+
+
+class Terminated(KeyboardInterrupt):
+    """A command that a signal has ended (SIGTERM of a preempted job, a lost terminal), after it has saved its work."""
 
 
 def run_command(name: str) -> int:
@@ -33,8 +42,10 @@ def run_command(name: str) -> int:
 
     The command's function is imported after the configuration is composed, because torch takes seconds to load. Modules
     that the user names, in ``plugins`` or by an import path, are imported first (:mod:`pace.config.plugins`). Wrong
-    input gives one line and status 2, an expected error one line and 1.
+    input gives one line and status 2, an expected error one line and 1; a run that SIGTERM has ended gives 75.
     """
+    if isinstance(sys.stdout, TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # names of files in letters that the terminal does not have
     try:
         if {"-h", "--help"} & set(sys.argv[1:]):
             return show(command_help(name, _topic(sys.argv[1:])))
@@ -42,10 +53,18 @@ def run_command(name: str) -> int:
     except ConfigError as error:
         return complain(str(error), EXIT_USAGE)
     _limit_threads()
+    status = _run(name)
+    _flush()
+    return status
+
+
+def _run(name: str) -> int:
     try:
         return _run_hydra(COMMANDS[name])
     except (HydraException, OmegaConfBaseException) as error:
         return complain(explain(name, sys.argv[1:], error), EXIT_USAGE)
+    except Terminated:
+        return EXIT_TERMINATED
     except KeyboardInterrupt:
         return complain("interrupted", EXIT_INTERRUPTED)
 
@@ -55,6 +74,14 @@ def _limit_threads() -> None:
     cores = usable_cores()
     if cores < len(core_set()):
         os.environ.setdefault("OMP_NUM_THREADS", str(cores))
+
+
+def _flush() -> None:
+    """Python would end with an error if the last of what was printed cannot be written, on a full disk for example."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _topic(arguments: Sequence[str]) -> str:
@@ -89,6 +116,10 @@ def _run_hydra(command: Command) -> int:
             status = complain(str(error), EXIT_USAGE)
         except tuple(failures) as error:
             status = complain(str(error), EXIT_FAILED)
+        except OSError as error:
+            if error.errno not in DISK:
+                raise
+            status = complain(": ".join(filter(None, (error.filename, error.strerror))), EXIT_FAILED)
 
     hydra.main(config_path=str(config_dir()), config_name=command.config, version_base="1.3")(guarded)()
     return status
@@ -126,7 +157,7 @@ def show(text: str) -> int:
     try:
         print(text, flush=True)
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python prints an error at exit
+        _flush()  # or Python prints an error at exit
     return 0
 
 

@@ -84,12 +84,17 @@ COMMANDS = {
     "play": Command(
         module="pace.viewer",
         work="pace.viewer.play:play_from_config",
-        failures=(CHECKPOINT_ERROR, "pace.sim.render:RenderError", "pace.viewer.web:PageError"),
+        failures=(
+            CHECKPOINT_ERROR,
+            "pace.sim.render:RenderError",
+            "pace.viewer.server:PageError",
+            "pace.sim.replay:ReplayError",
+        ),
         extra="viewer",
         config="play",
         summary="a policy on a live page in the browser, or in a video (--video FILE)",
         usage="RUN [--video FILE.mp4] [key=value ...]",
-        about=SAVED_RUN,
+        about=SAVED_RUN + " A file of a run's replays/ shows what went wrong in its training.",
         examples=(
             "pretrained/pace",
             "pretrained/pace ball=paper serve=short port=9000",

@@ -19,12 +19,22 @@ from omegaconf.errors import ConfigKeyError, OmegaConfBaseException
 
 from pace.config.limits import first_outside
 
+LONGEST = 1500  # letters of a message
 Range = list[float]
 T = TypeVar("T")
 
 
 class ConfigError(ValueError):
-    """A configuration that cannot be used; the message names the key and the cure."""
+    """A configuration that cannot be used; the message, in one line, names the key and the cure."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(printable(message))
+
+
+def printable(text: str) -> str:
+    """``text`` in one line: line ends and control characters, which may come from a user, as Python writes them."""
+    line = "".join(sign if sign.isprintable() else repr(sign)[1:-1] for sign in text[:LONGEST])
+    return line if len(text) <= LONGEST else f"{line} ..."
 
 
 def config_dir() -> Path:
@@ -87,14 +97,16 @@ def parse(config: DictConfig | dict[str, Any], schema: type[T]) -> T:
 
     Errors: :class:`ConfigError` that names the key, for an unknown or missing key, a wrong type or a bad value.
     """
-    plain = config if isinstance(config, DictConfig) else OmegaConf.create(config)
     try:
+        plain = config if isinstance(config, DictConfig) else OmegaConf.create(config)
         OmegaConf.resolve(plain)
         plain = schema.complete(plain) if issubclass(schema, Completed) else plain
         merged = OmegaConf.merge(OmegaConf.structured(schema), plain)
         parsed = OmegaConf.to_object(merged)
     except OmegaConfBaseException as error:
         raise ConfigError(f"configuration key '{error.full_key or '?'}': {_reason(error)}") from error
+    except OverflowError as error:  # a whole number that no float can hold
+        raise ConfigError(f"configuration key '{getattr(error, 'full_key', '?')}': {error}") from error
     wrong = first_outside(parsed)
     if wrong is not None:
         raise ConfigError(wrong)

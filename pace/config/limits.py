@@ -88,6 +88,7 @@ LIMITS: dict[str, dict[str, Limits]] = {
     "EngineConfig": {
         "physics_dt": STEP, "solver_iterations": (1, 1000), "line_search_iterations": (1, 1000), "threads": (0, 4096),
         "contacts_per_world": (1, 10_000), "constraints_per_world": (1, 100_000), "ball_dt": (1e-4, 1.0),
+        "largest_speed": (0.0, 1e9), "remembered_steps": (0, 10_000),
     },
     "ServeConfig": {
         "x": PLACE, "y": PLACE, "z": PLACE, "vx": SPEED, "vy": SPEED, "vz": SPEED, "topspin": SPIN, "sidespin": SPIN,
@@ -134,6 +135,7 @@ LIMITS: dict[str, dict[str, Limits]] = {
         "value_coefficient": (0.0, 1e6), "std_floor": AMPLITUDE, "learning_rate": (0.0, 10.0),
         "learning_rate_min": (0.0, 10.0), "learning_rate_max": (0.0, 10.0), "max_grad_norm": (TINY, 1e9),
         "observation_clip": (TINY, 1e9), "last_layer_gain": FACTOR, "fp32_below": AMPLITUDE, "params": ANY,
+        "skips": (0, 10**6),
     },
     "PlanConfig": {
         "warm_up": (0, 10**6), "updates": COUNT, "seconds": SECONDS, "samples": (1.0, 1e15),

@@ -21,7 +21,7 @@ def load_realities(name: str) -> dict[str, dict[str, list[str]]]:
     check_choice(GROUP, name)
     file = next(path for path in (folder / GROUP / f"{name}.yaml" for folder in config_dirs()) if path.is_file())
     try:
-        content = yaml.safe_load(file.read_text())
+        content = yaml.safe_load(file.read_text(encoding="utf-8"))
     except yaml.YAMLError as error:
         raise ConfigError(f"{file} is no YAML: {' '.join(str(error).split())}") from error
     if not isinstance(content, dict) or not all(isinstance(rows, dict) for rows in content.values()):

@@ -190,6 +190,8 @@ class EngineConfig:
     constraints_per_world: int  # mjwarp: memory for constraint rows
     paddle_reaction: bool  # the ball's impulse acts on the paddle over the next control step
     ball_dt: float  # s, longest sub-step of the ball's flight
+    largest_speed: float = field(default=0.0, kw_only=True)  # m/s, rad/s; a faster robot has diverged; 0: no limit
+    remembered_steps: int = field(default=0, kw_only=True)  # control steps that a replay of a fault goes back; 0: none
     # of CUDA for steps and updates on a GPU, of Warp for mjwarp on a CPU: auto, always, never; or dry, which goes a
     # GPU's way on a CPU and names what a graph could not hold
     graph: str = "auto"

@@ -46,6 +46,7 @@ class AlgoConfig:
     fp32_below: float = 0.0  # mean std of the policy below which autocast=mixed computes in float32
     algorithm: str = "ppo"  # or a class from outside: my_module:MyAlgorithm
     params: dict[str, float] = field(default_factory=dict)  # numbers of an algorithm from outside
+    skips: int = 0  # updates in a row that are skipped because they are not finite, before the run stops
     observation_norm: bool = True  # by running mean and std; off: observations in their own units, clipped
 
     @property

@@ -205,7 +205,7 @@ def training_versions(policy: TaskPolicy) -> dict[str, Any] | None:
     for folder in (checkpoint, checkpoint.parent.parent):  # a kept policy, or a checkpoint of a run
         if (folder / VERSIONS).is_file():
             try:
-                return json.loads((folder / VERSIONS).read_text())
+                return json.loads((folder / VERSIONS).read_text(encoding="utf-8"))
             except (OSError, ValueError):
                 return None
     return None

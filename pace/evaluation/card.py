@@ -32,7 +32,7 @@ def card(folder: Path, notes: str = "") -> str:
 
 
 def _read(file: Path) -> dict[str, Any]:
-    return json.loads(file.read_text()) if file.is_file() else {}
+    return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
 
 
 def _facts(folder: Path, versions: Mapping[str, Any]) -> str:

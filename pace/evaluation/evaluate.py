@@ -77,10 +77,10 @@ def evaluate_table(
     """Play the rows that ``config`` names, print their table and write it with its figures into ``folder``."""
     worlds = config.worlds_for(config.serves)
     record = partial(QualityRecorder, config=config.quality)
-    rows = [
-        _with_bar(config, policy, name, name, config.serves, worlds, config.device, overrides, record)
-        for name in config.rows
-    ]
+    rows: list[Row] = []
+    for name in config.rows:
+        rows.append(_with_bar(config, policy, name, name, config.serves, worlds, config.device, overrides, record))
+        write_report(folder, rows, config.paper, context)  # an evaluation that is stopped keeps its finished rows
     first = first_balls(config, policy, overrides)
     print(f"\n{tables(rows, config.paper, first_ball=first)}\n")
     files = write_report(folder, rows, config.paper, context, first)

@@ -18,7 +18,9 @@ from pace.config.base import parse
 from pace.config.commands import KeepConfig
 from pace.evaluation.card import CARD, card
 from pace.rl.policies import locate
-from pace.runs.checkpoint import FOLDER, META, WEIGHTS, CheckpointError, export_weights, find_checkpoint
+from pace.runs.checkpoint import META, WEIGHTS, CheckpointError, export_weights, find_checkpoint
+from pace.runs.checkpoint_folders import FOLDER
+from pace.runs.files import write_whole
 from pace.runs.metrics import write_slim
 from pace.runs.run_folder import METRICS
 
@@ -40,7 +42,7 @@ def keep_from_config(composed: DictConfig) -> None:
     assert config.run is not None  # guaranteed by KeepConfig
     assert config.out is not None
     try:
-        notes = Path(config.notes).read_text() if config.notes else ""
+        notes = Path(config.notes).read_text(encoding="utf-8") if config.notes else ""
         evaluation = Path(config.evaluation) if config.evaluation else None
         files = keep(locate(config.run), Path(config.out), evaluation, notes)
     except (OSError, UnicodeDecodeError) as error:
@@ -89,7 +91,7 @@ def is_published(folder: Path) -> bool:
     if not all((folder / name).is_file() for name in (CARD, META, WEIGHTS)):
         return False
     try:
-        meta = json.loads((folder / META).read_text())
+        meta = json.loads((folder / META).read_text(encoding="utf-8"))
     except ValueError:
         return False
     return isinstance(meta, dict) and "config" in meta and meta.get("training") is None
@@ -107,7 +109,7 @@ def write_policy(folder: Path, checkpoint: Path, evaluation: Path | None, notes:
             shutil.copyfile(source, folder / source.name)
     if (run / METRICS).is_file():
         (write_slim if of_a_run else shutil.copyfile)(run / METRICS, folder / METRICS)
-    (folder / CARD).write_text(card(folder, notes))
+    write_whole(folder / CARD, card(folder, notes))
     return sorted(file.name for file in folder.iterdir())
 
 

@@ -15,6 +15,7 @@ from pace.evaluation.quality_report import more_tables
 from pace.evaluation.records import COLUMNS, FAILURES, by_ball
 from pace.evaluation.serves import Row
 from pace.evaluation.text import interval, markdown_table, number, text_table
+from pace.runs.files import write_whole
 
 JSON, CSV, MARKDOWN, SERVES = "evaluation.json", "evaluation.csv", "evaluation.md", "serves.csv"
 UNITS = {
@@ -124,7 +125,7 @@ def flat(row: Mapping[str, Any]) -> dict[str, Any]:
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Strict JSON, NaN as null."""
-    path.write_text(json.dumps(clean(content), indent=1, allow_nan=False) + "\n")
+    write_whole(path, json.dumps(clean(content), indent=1, allow_nan=False) + "\n")
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -134,12 +135,12 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     writer = csv.DictWriter(text, list(flattened[0]))
     writer.writeheader()
     writer.writerows(flattened)
-    path.write_text(text.getvalue())
+    write_whole(path, text.getvalue())
 
 
 def write_serves(path: Path, rows: Sequence[Row]) -> None:
     """Every counted serve, one per line: its range, then ``COLUMNS``."""
-    with path.open("w", newline="") as file:
+    with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(("serve", *COLUMNS))
         for row in rows:
@@ -163,7 +164,7 @@ def write_report(
     write_json(files[0], content | more(rows, first_ball))
     write_csv(files[1], summaries)
     title = f"# Evaluation of {context['policy']}\n\n{describe(context)}\n"
-    files[2].write_text(f"{title}\n{tables(rows, paper, markdown=True, first_ball=first_ball)}\n")
+    write_whole(files[2], f"{title}\n{tables(rows, paper, markdown=True, first_ball=first_ball)}\n")
     write_serves(files[3], rows)
     return files
 

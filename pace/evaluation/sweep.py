@@ -161,7 +161,7 @@ def finished_cells(folder: Path, cells: Sequence[Cell]) -> Tables:
     if not file.exists():
         return {}
     try:
-        tables = {cell["key"]: cell["rows"] for cell in json.loads(file.read_text())["cells"]}
+        tables = {cell["key"]: cell["rows"] for cell in json.loads(file.read_text(encoding="utf-8"))["cells"]}
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise EvaluationError(f"{file} is no file of a sweep ({error!r}): give another out=") from error
     if not set(tables) <= {cell.key for cell in cells}:

@@ -40,7 +40,7 @@ def forecast_flight(
 
     Returns:
         :class:`pace.sim.ball.Forecast`: tensors (N, ...) on the device of ``position``, in m and s from now, NaN if an
-        event does not occur. The flight is that of the simulation.
+        event does not occur, and for numbers beyond float32. The flight is that of the simulation.
 
     Errors: ``ValueError`` for another shape than (N, 3).
     """
@@ -55,4 +55,7 @@ def forecast_flight(
     )
     everyone = torch.ones(count, dtype=torch.bool, device=device)
     sim.forecast(everyone, position, velocity, spin, intercept_x)
+    for values in vars(sim.forecast_result).values():
+        if isinstance(values, Tensor) and values.is_floating_point():
+            values.masked_fill_(values.isinf(), torch.nan)  # beyond float32
     return sim.forecast_result

@@ -14,7 +14,7 @@ from pace.arrays.graph import CapturedCall, Graphs
 from pace.config.predictor import PredictorConfig
 from pace.distributed import ProcessGroup
 from pace.predictor.network import BallPredictor
-from pace.runs.optimiser import adam, load_optimiser_state, optimiser_state
+from pace.runs.optimiser import adam, live_state, load_optimiser_state, optimiser_state
 from pace.runs.reading import read
 
 TIME_BINS = (0.0, 0.1, 0.2, 0.3, 0.4)  # s before the apex; the first and the last bin are open
@@ -165,6 +165,10 @@ class PredictorTrainer:
     def state_dict(self) -> dict[str, Any]:
         """Adam's moments and the count of updates; the network's weights are saved with the policy's."""
         return {"updates": self.updates, **optimiser_state(self.optimiser)}
+
+    def live_state(self) -> dict[str, Any]:
+        """:meth:`state_dict` without a wait for the device: the tensors themselves."""
+        return {"updates": self.updates, **live_state(self.optimiser)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore the result of :meth:`state_dict`."""

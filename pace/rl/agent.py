@@ -66,7 +66,7 @@ class RunningNorm(nn.Module):
         self.register_buffer("finite", torch.ones((), dtype=torch.bool), persistent=False)
         self.register_buffer("_scale", torch.ones(size), persistent=False)
         self.register_buffer("_shift", torch.zeros(size), persistent=False)
-        self.register_load_state_dict_post_hook(lambda module, _: module._refresh())
+        self.register_load_state_dict_post_hook(lambda module, _: module._loaded())
 
     @torch.no_grad()
     def update(self, observation: Tensor) -> None:
@@ -86,6 +86,11 @@ class RunningNorm(nn.Module):
         self.var.copy_(torch.where(finite, merged, self.var))
         self.count.copy_(torch.where(finite, total, self.count))
         self.finite.logical_and_(finite)
+        self._refresh()
+
+    def _loaded(self) -> None:
+        """After other moments were loaded: the batches that ``finite`` is about are not those behind them."""
+        self.finite.fill_(True)
         self._refresh()
 
     def moments(self) -> tuple[Tensor, Tensor, Tensor]:

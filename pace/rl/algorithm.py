@@ -96,8 +96,12 @@ class InPlace(Protocol):
 
     ``begin``, ``step`` and ``finish`` do the same work on the same tensors in each rollout, until :meth:`storage` is
     another one; so a rollout can be a graph (:class:`pace.arrays.graph.CapturedCall`). ``fault`` is only asked after
-    the update, if the rollout was not :meth:`healthy`. The metrics of an update are finite, or the run ends.
+    the update, if the rollout was not :meth:`healthy`. The metrics of an update are finite, or it is undone.
     """
+
+    def live_state(self) -> dict[str, Any]:
+        """``state_dict`` with the tensors themselves, without a wait: it is copied before each update."""
+        ...
 
     def storage(self) -> object:
         """What the rollout is stored in, after ``prepare``: another object has other tensors."""

@@ -26,7 +26,7 @@ from pace.rl.loss import PPOLoss
 from pace.rl.minibatch import gather, minibatch_of
 from pace.rl.rollout import Rollout, VectorTask, require_finite
 from pace.runs.checkpoint import load_weights
-from pace.runs.optimiser import adam, learning_rate, load_optimiser_state, optimiser_state
+from pace.runs.optimiser import adam, learning_rate, live_state, load_optimiser_state, optimiser_state
 from pace.runs.reading import read
 
 LOSS_METRICS = (
@@ -181,15 +181,19 @@ class PPO:
 
     def state_dict(self) -> dict[str, Any]:
         """Both optimisers' moments and the adapted learning rates."""
-        return {
-            "actor_optimiser": optimiser_state(self.actor_optimiser),
-            "critic_optimiser": optimiser_state(self.critic_optimiser),
-        }
+        return {name: optimiser_state(optimiser) for name, optimiser in self._optimisers()}
+
+    def live_state(self) -> dict[str, Any]:
+        """:meth:`state_dict` without a wait for the device: the tensors themselves."""
+        return {name: live_state(optimiser) for name, optimiser in self._optimisers()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore the result of :meth:`state_dict`."""
-        load_optimiser_state(self.actor_optimiser, state["actor_optimiser"])
-        load_optimiser_state(self.critic_optimiser, state["critic_optimiser"])
+        for name, optimiser in self._optimisers():
+            load_optimiser_state(optimiser, state[name])
+
+    def _optimisers(self) -> tuple[tuple[str, torch.optim.Adam], ...]:
+        return ("actor_optimiser", self.actor_optimiser), ("critic_optimiser", self.critic_optimiser)
 
 
 class AsymmetricPPO:
@@ -247,7 +251,7 @@ class AsymmetricPPO:
         return self.storage().fault()
 
     def update(self, at: Position) -> dict[str, Tensor]:
-        """One set of normalisers for all processes, then :meth:`PPO.learn`."""
+        """One set of normalisers for all, then :meth:`PPO.learn`."""
         for norm, moments in zip(self._norms(), self._moments, strict=True):
             norm.pool(moments, self.group)
         return self.ppo.learn(self.storage(), at)
@@ -276,6 +280,10 @@ class AsymmetricPPO:
     def state_dict(self) -> dict[str, Any]:
         """See :meth:`PPO.state_dict`; and whether the networks have come to float32."""
         return self.ppo.state_dict() | {"fine": self.agent.fine}
+
+    def live_state(self) -> dict[str, Any]:
+        """See :meth:`PPO.live_state`."""
+        return self.ppo.live_state() | {"fine": self.agent.fine}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore the result of :meth:`state_dict`. The number format of older runs follows from the policy."""

@@ -21,7 +21,7 @@ from pace.predictor.network import make_predictor
 from pace.predictor.priors import resolve_priors
 from pace.predictor.regression import PredictorTrainer
 from pace.rl.practice import ServePractice
-from pace.runs.checkpoint import FOLDER, Checkpoint, save_checkpoint
+from pace.runs.checkpoint import Checkpoint
 from pace.runs.interrupt import StopRequest
 from pace.runs.optimiser import learning_rate
 from pace.runs.progress import Progress
@@ -41,6 +41,7 @@ class PredictorRun:
         torch.manual_seed(config.seed)
         config.predictor = resolve_priors(config)
         self.config = config
+        self.stop = StopRequest()
         self.network = make_predictor(config.predictor).to(device)
         self.practice = ServePractice(config, device)
         self.practice.desynchronise()
@@ -66,9 +67,11 @@ class PredictorRun:
         config, per_update = self.config, self.config.num_worlds * self.config.algo.steps
         progress = Progress(config.progress, config.samples, 60.0 * config.minutes, shown=["predictor_rmse_cm"])
         started = last = time.monotonic()
-        update, limit, stop = 0, 60.0 * config.minutes if config.minutes > 0 else math.inf, StopRequest()
-        with stop.listening():
-            while (done := max(update * per_update / config.samples, (last - started) / limit)) < 1 and not stop.name:
+        update, limit = 0, 60.0 * config.minutes if config.minutes > 0 else math.inf
+        with self.stop.listening():
+            while (done := max(update * per_update / config.samples, (last - started) / limit)) < 1:
+                if self.stop.name is not None:
+                    break
                 self.slow_down(done)
                 self.play()
                 update += 1
@@ -99,14 +102,14 @@ def train_predictor(composed: DictConfig) -> None:
     config.out = str(run.path)
     print(f"training the predictor on serves in {config.num_worlds} worlds, run folder {run.path}", flush=True)
     counters = session.train(run)
-    run.close()
     errors = session.measure()
     weights = {"predictor": session.network.state_dict()}
-    folder = run.path / FOLDER / f"update_{int(counters['updates']):08d}"
-    save_checkpoint(folder, Checkpoint(to_dict(config), counters, weights, None))
+    folder = run.save(int(counters["updates"]), Checkpoint(to_dict(config), counters, weights, None), last=True)
+    run.close()
     result = {"errors": errors, "counters": counters, "ball": config.ball.name, "serve": config.serve.name}
-    (run.path / RESULT).write_text(json.dumps(result, indent=1))
+    (run.path / RESULT).write_text(json.dumps(result, indent=1), encoding="utf-8")
     for name, value in errors.items():
         print(f"{name}: {value:.2f}")
     for file in (folder, run.path / RESULT, run.path / METRICS):
         print(f"wrote {file}")
+    session.stop.require_not_terminated()

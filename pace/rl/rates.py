@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-COUNTS = ("serves", "hits", "successes", "falls", "episodes", "steps", "reward_sum")
+COUNTS = ("serves", "hits", "successes", "falls", "episodes", "steps", "reward_sum", "diverged")
 
 
 def rates(sums: Mapping[str, float], control_dt: float) -> dict[str, float]:
@@ -25,6 +25,7 @@ def rates(sums: Mapping[str, float], control_dt: float) -> dict[str, float]:
         "mean_reward": share("reward_sum", "steps"),
         "episodes": sums["episodes"],
         "serves": sums["serves"],
+        "diverged": sums.get("diverged", 0.0),
     }
     for name in sums:
         if name.startswith("reward/"):

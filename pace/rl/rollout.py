@@ -19,6 +19,7 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate
 from pace.arrays.graph import Graphs
 from pace.predictor.regression import PredictorSource
 from pace.rl.agent import Agent
+from pace.sim.replay import WorldReplay
 
 CRITIC_ROWS = 8192  # rows of one critic pass after the rollout: bounds the memory of its activations
 
@@ -62,6 +63,10 @@ class TrainableTask(VectorTask, PredictorSource, Protocol):
 
     def pop_statistics(self) -> dict[str, Tensor]:
         """Sums since the last call, 0-d tensors: serves, hits, successes, falls, episodes, steps, rewards, ..."""
+        ...
+
+    def replays(self) -> list[WorldReplay]:
+        """The last control steps of worlds whose numbers went wrong since the last call. Waits for the device."""
         ...
 
     def warn_of_overflow(self) -> None:

@@ -31,7 +31,9 @@ from pace.rl.kernels import warm
 from pace.rl.plan import in_millions
 from pace.rl.policies import locate
 from pace.rl.trainer import Summary, Trainer, device_type_of, restarts_worlds
-from pace.runs.checkpoint import FOLDER, NAME, Checkpoint, CheckpointError, load_checkpoint
+from pace.runs.checkpoint import Checkpoint, CheckpointError, load_checkpoint
+from pace.runs.checkpoint_folders import FOLDER, NAME
+from pace.runs.files import tell
 from pace.runs.learning_curve import CURVE
 from pace.runs.progress import rate_texts
 from pace.runs.run_folder import METRICS, RunFolder, is_run
@@ -68,6 +70,7 @@ def train_from_config(composed: DictConfig) -> None:
         summary = trainer.train()
     if summary is not None:
         report(summary)
+        trainer.stop.require_not_terminated()
 
 
 def machine_for(config: TrainConfig, device: torch.device) -> automatic.Machine:
@@ -215,23 +218,22 @@ def announce(trainer: Trainer, run: RunFolder, saved: Checkpoint | None, chosen:
         print(f"for this device: {automatic.in_words(chosen)}")
     if saved is not None:
         new_worlds = ", with new worlds" if restarts_worlds(saved, trainer.group, trainer.device) else ""
-        print(f"resuming from {saved.path}{new_worlds}")
+        tell(f"resuming from {saved.path}{new_worlds}")
     if trainer.plan.samples is not None:
-        print(f"planned: {in_millions(trainer.plan.samples)}")
+        tell(f"planned: {in_millions(trainer.plan.samples)}")
     shared = f" in {trainer.group.size} processes" if trainer.group.size > 1 else ""
-    print(
+    tell(
         f"training {trainer.config.name}: {trainer.config.num_worlds} worlds on {trainer.device}{shared}, "
-        f"{trainer.algorithm.describe()}, run folder {run.path}",
-        flush=True,
+        f"{trainer.algorithm.describe()}, run folder {run.path}"
     )
 
 
 def report(summary: Summary) -> None:
     """Print how the run ended and which files it wrote."""
     folder = summary.checkpoint.parent.parent
-    print(
+    tell(
         f"{summary.reason}: {summary.updates} updates, {summary.samples:,} samples, {summary.seconds / 60:.1f} min\n"
-        f"last updates: {', '.join(rate_texts(summary.rates))}\n"
+        f"last updates: {', '.join([*rate_texts(summary.rates), *summary.faults])}\n"
         f"wrote {summary.checkpoint}\n"
         f"wrote {folder / METRICS}" + (f"\nwrote {folder / CURVE}" if summary.curve else "")
     )

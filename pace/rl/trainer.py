@@ -20,24 +20,15 @@ from pace.rl.agent import Sizes
 from pace.rl.algorithm import ALGORITHMS
 from pace.rl.curriculum import Curriculum
 from pace.rl.plan import Plan
-from pace.rl.rollout import RolloutError, TrainableTask
+from pace.rl.recovery import Recovery
+from pace.rl.rollout import TrainableTask
 from pace.rl.update import Update
-from pace.runs.checkpoint import (
-    FOLDER,
-    LAST_GOOD,
-    Checkpoint,
-    CheckpointError,
-    list_checkpoints,
-    load_weights,
-    prune_checkpoints,
-    save_checkpoint,
-)
+from pace.runs.checkpoint import Checkpoint, CheckpointError, load_weights
 from pace.runs.interrupt import StopRequest
 from pace.runs.learning_curve import plot_learning_curve
 from pace.runs.progress import Progress
 from pace.runs.run_folder import RunFolder
 
-CHECKPOINTS_KEPT = 4
 LEARNER, OLD_LEARNER = "algorithm", "ppo"  # part of a checkpoint's training state, and its former name
 
 
@@ -52,6 +43,7 @@ class Summary:
     checkpoint: Path
     curve: Path | None
     rates: dict[str, float]
+    faults: list[str]  # in words
 
 
 class Trainer:
@@ -87,7 +79,9 @@ class Trainer:
         self._update = Update(self.algorithm, self.regression, networks, config.robot.control_dt, group)
         self.updates, self.samples, self.wall_s = 0, 0, 0.0
         self.plan = Plan(config)
-        self._stop = StopRequest()
+        learners = {LEARNER: self.algorithm, "regression": self.regression}
+        self._recovery = Recovery(config, dict(self._networks()), learners, run, group)
+        self.stop = StopRequest()
         self._saved_at = time.monotonic()
 
     def train(self) -> Summary | None:
@@ -95,8 +89,9 @@ class Trainer:
 
         Returns the summary on rank 0, and None on the other ranks.
 
-        Errors: :class:`RolloutError` if values are not finite. The weights before that update are then saved in
-        ``last_good/`` (for ``init_from``), and the last checkpoint stays the newest (for ``resume``).
+        Errors: :class:`RolloutError` if values are not finite in more than ``algo.skips`` updates in a row. The weights
+        before them are then saved in ``last_good/`` (for ``init_from``), and the last checkpoint stays the newest (for
+        ``resume``).
         """
         config = self.config
         if self.samples >= config.samples:
@@ -104,11 +99,11 @@ class Trainer:
         shown = config.progress and self.group.is_rank_0
         progress = Progress(shown, config.samples, 60.0 * config.minutes, self.samples)
         started = last = time.monotonic()
-        wall_before, reason = self.wall_s, None
+        wall_before, reason, newest = self.wall_s, None, None
         try:
             if self.run is not None:
                 self.run.begin()
-            with self._stop.listening():
+            with self.stop.listening():
                 while reason is None:
                     row = self._safe_update()
                     now = time.monotonic()
@@ -120,28 +115,27 @@ class Trainer:
                         self.run.log(row)
                     self._measure(now - started, progress)
                     reason, due = self.group.broadcast_object((self._reason_to_end(now - started), self._save_is_due()))
-                    if due or reason is not None:
-                        self.save()
+                    if (due and not self._recovery.in_a_row) or reason is not None:
+                        newest = self.save(last=reason is not None)
         finally:
             progress.close()
             if self.run is not None:
                 self.run.close()
-        if self.run is None:
+        if self.run is None or newest is None:
             return None
-        newest, curve = list_checkpoints(self.run.path)[-1], plot_learning_curve(self.run.path)
-        return Summary(reason, self.updates, self.samples, self.wall_s, newest, curve, progress.rates())
+        curve, rates = plot_learning_curve(self.run.path), progress.rates()
+        faults = progress.fault_texts()
+        return Summary(reason, self.updates, self.samples, self.wall_s, newest, curve, rates, faults)
 
     def _safe_update(self) -> dict[str, float]:
-        """:meth:`update`; when it fails, the weights before it are saved beside the checkpoints."""
-        good = {part: {k: v.clone() for k, v in module.state_dict().items()} for part, module in self._networks()}
-        try:
-            return self.update()
-        except RolloutError as error:
-            if self.run is None:
-                raise
-            checkpoint = Checkpoint(to_dict(self.config), self._counters(), good, None)
-            folder = save_checkpoint(self.run.path / LAST_GOOD, checkpoint)
-            raise RolloutError(f"{error}; the weights before this update are in {folder}") from error
+        """:meth:`update`; one that is not finite is undone and counted. The control steps of its rollout count."""
+        row = self._recovery.attempt(self.update, self.env, self._counters())
+        if row is not None:
+            return row | {"skipped": 0.0}
+        self.algorithm.weights_loaded(new_run=False)
+        self.samples += self._samples_per_update
+        self.updates += 1
+        return {"update": self.updates, "samples": self.samples, "skipped": 1.0}
 
     def _networks(self) -> tuple[tuple[str, nn.Module], ...]:
         return (("agent", self.algorithm.agent), ("predictor", self.predictor))
@@ -188,8 +182,8 @@ class Trainer:
             progress.say(said)
 
     def _reason_to_end(self, seconds: float) -> str | None:
-        if self._stop.name is not None:
-            return f"stopped by {self._stop.name}"
+        if self.stop.name is not None:
+            return f"stopped by {self.stop.name}"
         if self.samples >= self.config.samples:
             return f"samples={self.config.samples:g} reached"
         if 0 < 60.0 * self.config.minutes <= seconds:
@@ -199,14 +193,15 @@ class Trainer:
     def _save_is_due(self) -> bool:
         return time.monotonic() - self._saved_at >= 60.0 * self.config.checkpoint_minutes
 
-    def save(self) -> None:
-        """Write a checkpoint of the current state and delete old ones."""
+    def save(self, last: bool = False) -> Path | None:
+        """Write a checkpoint of the current state and delete old ones; see :meth:`RunFolder.save`. None on other ranks.
+
+        Errors: :class:`CheckpointError` if the ``last`` one of the run cannot be written.
+        """
         self.env.warn_of_overflow()
         checkpoint = self.checkpoint()
-        if self.run is not None:
-            save_checkpoint(self.run.path / FOLDER / f"update_{self.updates:08d}", checkpoint)
-            prune_checkpoints(self.run.path, CHECKPOINTS_KEPT)
         self._saved_at = time.monotonic()
+        return self.run.save(self.updates, checkpoint, last) if self.run is not None else None
 
     def checkpoint(self) -> Checkpoint:
         """Everything that the next update depends on, of all ranks."""

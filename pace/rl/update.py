@@ -25,7 +25,8 @@ class Update:
     """Rolls out, fits the predictor and lets the algorithm learn, together with the other processes of the ``group``.
 
     An algorithm that is :class:`InPlace` waits for the device once, at the end: the metrics, all checks and the counts
-    of the task are one message. A fault is found only then, and the weights are no longer good.
+    of the task are one message. A fault is found only then, and the weights are no longer good: the caller has a copy
+    of those before (:class:`pace.rl.recovery.Recovery`).
 
     Args: networks: all that are trained.
     """
@@ -47,7 +48,7 @@ class Update:
     def __call__(self, env: TrainableTask, at: Position) -> dict[str, float]:
         """One update in the worlds of ``env``, ``at`` a place in the run; returns its metrics.
 
-        Errors: :class:`RolloutError`, on every rank, if one of them has a fault. The weights must then not be saved.
+        Errors: :class:`RolloutError`, on every rank, if one of them has a fault. The weights must then be put back.
         """
         self._play(env, at)
         if self._in_place is None:

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,19 +22,10 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from pace.config.upgrade import FORMAT, upgrade_config, upgrade_state
+from pace.runs.checkpoint_folders import META, TRAINING, WEIGHTS, CheckpointError, find_checkpoint, holds_nothing_else
 from pace.runs.files import reason
 
-META, WEIGHTS, TRAINING = "checkpoint.json", "weights.safetensors", "training.safetensors"
-FOLDER = "checkpoints"
-FILES = (META, WEIGHTS, TRAINING)
-NAME = re.compile(r"update_(\d{8,})")  # of the folders that a run writes; others beside them are the user's
-LAST_GOOD = "last_good"  # folder in a run: the weights before an update that failed
-LEFTOVER = re.compile(rf"\.(update_\d{{8,}}|{LAST_GOOD})\.\d+\.(tmp|old)")  # of a kill while a checkpoint was written
 TENSOR_MARK = "__tensor__"
-
-
-class CheckpointError(RuntimeError):
-    """A checkpoint that cannot be found, read or used; the message names the file and the reason."""
 
 
 @dataclass
@@ -69,9 +60,10 @@ def restore_tensors(value: Any, tensors: Mapping[str, Tensor], source: Path) -> 
     """Inverse of :func:`flatten_tensors` (tuples come back as lists)."""
     if isinstance(value, dict):
         if TENSOR_MARK in value:
-            if value[TENSOR_MARK] not in tensors:
-                raise CheckpointError(f"{source}: the tensor {value[TENSOR_MARK]} is missing")
-            return tensors[value[TENSOR_MARK]]
+            name = str(value[TENSOR_MARK])
+            if name not in tensors:
+                raise CheckpointError(f"{source}: the tensor {name} is missing")
+            return tensors[name]
         return {key: restore_tensors(item, tensors, source) for key, item in value.items()}
     if isinstance(value, list):
         return [restore_tensors(item, tensors, source) for item in value]
@@ -109,7 +101,10 @@ def _write(folder: Path, checkpoint: Checkpoint) -> None:
         meta["training"] = flatten_tensors(checkpoint.training, "", training)
         save_file(training, folder / TRAINING)
     save_file(weights, folder / WEIGHTS)
-    (folder / META).write_text(json.dumps(meta, indent=1))
+    (folder / META).write_text(json.dumps(meta, indent=1), encoding="utf-8")
+    readers = (folder / META).stat().st_mode & 0o777  # safetensors closes its files to everybody else
+    for file in folder.iterdir():
+        file.chmod(readers)
     for file in (*folder.iterdir(), folder):
         _sync(file)  # before the rename makes them the newest checkpoint
 
@@ -139,68 +134,6 @@ def _sync(path: Path) -> None:
         os.close(handle)
 
 
-def clear_leftovers(run: Path) -> None:
-    """Remove what a kill has left of checkpoints that were being written. The caller owns the run."""
-    for folder in (path for place in (run, run / FOLDER) for path in _entries(place)):
-        left = LEFTOVER.fullmatch(folder.name)
-        if left is None or folder.is_symlink() or not holds_nothing_else(folder):
-            continue
-        if left[2] == "old" and not folder.with_name(left[1]).exists():
-            folder.rename(folder.with_name(left[1]))
-        else:
-            shutil.rmtree(folder)
-
-
-def _entries(folder: Path) -> list[Path]:
-    return sorted(folder.iterdir()) if folder.is_dir() else []
-
-
-def holds_nothing_else(folder: Path) -> bool:
-    """Whether a folder has the files of a checkpoint, or some of them, and nothing that a user has put there."""
-    return folder.is_dir() and all(file.name in FILES for file in folder.iterdir())
-
-
-def find_checkpoint(path: str | Path) -> Path:
-    """Folder of the checkpoint that ``path`` means: a run folder (its newest), a checkpoint folder, or a file in one.
-
-    Errors: :class:`CheckpointError` when there is none.
-    """
-    try:
-        return _find(Path(path))
-    except (OSError, ValueError) as error:  # no permission; a name that is too long, or has a zero byte
-        raise CheckpointError(f"{path} cannot be read: {reason(error)}") from error
-
-
-def _find(path: Path) -> Path:
-    if path.is_file():
-        path = path.parent
-    if not path.exists():
-        raise CheckpointError(f"{path} does not exist: give a run folder or a checkpoint")
-    if (path / META).is_file():
-        return path
-    if (path / FOLDER).is_dir():
-        found = list_checkpoints(path)
-        if found:
-            return found[-1]
-        others = ", ".join(other.name for other in _entries(path / FOLDER) if (other / META).is_file())
-        named = f"; {FOLDER}/ holds {others}: name one of them" if others else ""
-        raise CheckpointError(f"{path} is a run folder without a checkpoint{named}")
-    raise CheckpointError(f"{path} is neither a run folder nor a checkpoint: it has no {FOLDER}/ and no {META}")
-
-
-def list_checkpoints(run: Path) -> list[Path]:
-    """Complete checkpoints that a run has written, oldest first. Copies beside them, of other names, are the user's."""
-    there = (folder for folder in _entries(run / FOLDER) if NAME.fullmatch(folder.name))
-    return sorted((folder for folder in there if (folder / META).is_file()), key=update_of)
-
-
-def update_of(checkpoint: Path) -> int:
-    """The update at which a run has written ``checkpoint``, by its name."""
-    name = NAME.fullmatch(checkpoint.name)
-    assert name is not None  # of a run
-    return int(name[1])
-
-
 def load_checkpoint(path: str | Path, weights_only: bool = False) -> Checkpoint:
     """Read the checkpoint that ``path`` means (see :func:`find_checkpoint`), onto the CPU.
 
@@ -208,12 +141,35 @@ def load_checkpoint(path: str | Path, weights_only: bool = False) -> Checkpoint:
     """
     folder = find_checkpoint(path)
     meta = read_meta(folder)
-    weights = restore_tensors(meta["weights"], _read_tensors(folder / WEIGHTS), folder / WEIGHTS)
+    weights = _restore(meta["weights"], folder / WEIGHTS)
+    for part, tensors in weights.items():
+        if not isinstance(tensors, dict) or not all(isinstance(tensor, Tensor) for tensor in tensors.values()):
+            raise CheckpointError(f"{folder / META}: the weights of {part} are no tensors by name")
     training = None
     if meta["training"] is not None and not weights_only:
-        training = restore_tensors(meta["training"], _read_tensors(folder / TRAINING), folder / TRAINING)
-        training = upgrade_state(training, meta["format"])
+        training = _restore(meta["training"], folder / TRAINING)
+        with _of_another_form(folder / META, "training state"):
+            training = upgrade_state(training, meta["format"])
     return Checkpoint(meta["config"], meta["counters"], weights, training, folder)
+
+
+def _restore(described: Any, file: Path) -> Any:
+    """What ``checkpoint.json`` describes, with the tensors of ``file``."""
+    try:
+        return restore_tensors(described, _read_tensors(file), file)
+    except RecursionError as error:
+        raise CheckpointError(f"{file.parent / META} cannot be read: {error}") from error
+
+
+@contextmanager
+def _of_another_form(file: Path, part: str) -> Iterator[None]:
+    """Errors: :class:`CheckpointError` for content that no version of pace has written, while that is upgraded."""
+    try:
+        yield
+    except (AttributeError, KeyError, IndexError, TypeError, ValueError) as error:
+        raise CheckpointError(
+            f"{file}: the {part} is of no version of pace ({type(error).__name__}: {error})"
+        ) from error
 
 
 def read_meta(folder: Path) -> dict[str, Any]:
@@ -225,19 +181,32 @@ def read_meta(folder: Path) -> dict[str, Any]:
     """
     file = folder / META
     try:
-        meta = json.loads(file.read_text())
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        meta = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:  # no text, no JSON, numbers or depths that make no sense
         raise CheckpointError(f"{file} cannot be read: {error}") from error
     if not isinstance(meta, dict) or "format" not in meta:
         raise CheckpointError(f"{file} is not a checkpoint: it has no format number")
-    if meta["format"] not in range(1, FORMAT + 1):
+    if type(meta["format"]) is not int or meta["format"] not in range(1, FORMAT + 1):
         raise CheckpointError(f"{file} has format {meta['format']}, this version of pace reads format 1 to {FORMAT}")
     missing = [key for key in ("config", "counters", "weights", "training") if key not in meta]
     if missing:
         raise CheckpointError(f"{file} lacks {', '.join(missing)}")
-    if isinstance(meta["config"], dict):
+    _check_form(meta, file)
+    with _of_another_form(file, "configuration"):
         meta["config"] = upgrade_config(meta["config"], meta["format"])
     return meta
+
+
+def _check_form(meta: dict[str, Any], file: Path) -> None:
+    """Errors: :class:`CheckpointError` for parts of another kind than those that are written."""
+    for part in ("config", "counters", "weights"):
+        if not isinstance(meta[part], dict):
+            raise CheckpointError(f"{file}: {part} is no table: is it of another version of pace?")
+    if not isinstance(meta["training"], dict | None):
+        raise CheckpointError(f"{file}: training is no table")
+    for name, count in meta["counters"].items():
+        if isinstance(count, bool) or not isinstance(count, int | float) or not 0 <= count < 1e18:
+            raise CheckpointError(f"{file}: counters.{name} is {count!r}")
 
 
 def _read_tensors(file: Path) -> dict[str, Tensor]:
@@ -265,13 +234,6 @@ def load_weights(module: nn.Module, weights: Mapping[str, Tensor], source: str) 
     if unknown:
         raise CheckpointError(f"{source}: the tensor {unknown[0]} is not of this network")
     module.load_state_dict(dict(weights))
-
-
-def prune_checkpoints(run: Path, keep: int) -> None:
-    """Delete all but the newest ``keep`` checkpoints of a run; not one that is a link, or to which files were added."""
-    for folder in list_checkpoints(run)[:-keep]:
-        if not folder.is_symlink() and holds_nothing_else(folder):
-            shutil.rmtree(folder, ignore_errors=True)
 
 
 #: Keys of where and how a run was made, not of what it learned: a published policy has their defaults.

@@ -19,20 +19,28 @@ def say(text: str) -> None:
         tqdm.write(text, file=sys.stderr)
 
 
+def tell(text: str) -> None:
+    """Print to stdout at once. A log on a full disk, or a closed pipe, does not end a run."""
+    with suppress(OSError):
+        print(text, flush=True)
+
+
 def reason(error: Exception) -> str:
     """Why an operation on a file failed, in a few words."""
     return (error.strerror if isinstance(error, OSError) else None) or " ".join(str(error).split())
 
 
-def write_whole(file: Path, text: str) -> None:
-    """Write ``file``, or leave what is there: the new text replaces it when it is on the disk.
+def write_whole(file: Path, content: str | bytes) -> None:
+    """Write ``file``, or leave what is there: the new content replaces it when it is on the disk.
+
+    Text is UTF-8. Names of files in it that the locale cannot read are written byte by byte, as the disk has them.
 
     Errors: ``OSError``.
     """
     temporary = file.with_name(f".{file.name}.{os.getpid()}.tmp")
     try:
-        with temporary.open("w") as handle:
-            handle.write(text)
+        with temporary.open("wb") as handle:
+            handle.write(content.encode(errors="surrogateescape") if isinstance(content, str) else content)
             handle.flush()
             os.fsync(handle.fileno())
         temporary.replace(file)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from io import BytesIO
 from pathlib import Path
 
+from pace.runs.files import reason, say, write_whole
 from pace.runs.metrics import read_metrics
 
 CURVE = "learning_curve.png"
@@ -21,10 +23,11 @@ def moving_average(values: list[float], window: int) -> list[float]:
 
 
 def plot_learning_curve(run: str | Path) -> Path | None:
-    """Draw ``learning_curve.png`` from the run's CSV; None when it has fewer than two rows."""
+    """Draw ``learning_curve.png`` from the run's CSV; None when it has fewer than two rows, or cannot be written."""
     from matplotlib.figure import Figure  # imported here: it takes a second that no training should wait for
 
-    metrics = read_metrics(Path(run) / "metrics.csv")
+    csv = Path(run) / "metrics.csv"
+    metrics = read_metrics(csv) if csv.is_file() else {}
     if len(metrics.get("update", [])) < 2:
         return None
     millions = [samples / 1e6 for samples in metrics["samples"]]
@@ -49,5 +52,11 @@ def plot_learning_curve(run: str | Path) -> Path | None:
         axes.legend(loc="best")
     axes.set_xlabel(f"control steps, millions (mean of {CURVE_WINDOW} updates)")
     file = Path(run) / CURVE
-    figure.savefig(file, dpi=110)
+    picture = BytesIO()
+    figure.savefig(picture, dpi=110)
+    try:
+        write_whole(file, picture.getvalue())
+    except OSError as error:
+        say(f"warning: {file} cannot be written: {reason(error)}")
+        return None
     return file

@@ -71,7 +71,7 @@ class Passage:
 
 def read_metrics(file: str | Path, columns: Iterable[str] | None = None) -> dict[str, list[float]]:
     """Columns of a ``metrics.csv``, all or those of ``columns`` that it has; an empty cell is NaN."""
-    with Path(file).open(newline="", errors="replace") as handle:
+    with Path(file).open(encoding="utf-8", newline="", errors="replace") as handle:
         rows = list(csv.DictReader(handle))
     head = [name for name in (rows[0] if rows else ()) if name is not None]  # None: cells beyond the columns
     names = [name for name in head if columns is None or name in set(columns)]
@@ -167,7 +167,7 @@ def write_slim(source: str | Path, target: str | Path, every: int = SLIM_ROWS) -
     metrics = read_metrics(source, SLIM_COLUMNS)
     names = [name for name in SLIM_COLUMNS if name in metrics]
     count = len(metrics.get("samples", ()))
-    with Path(target).open("w", newline="") as file:
+    with Path(target).open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(names)
         for start in range(0, count, every):

@@ -41,7 +41,7 @@ class MetricsFile:
 
     def _take_over(self, path: Path, first_update: int) -> None:
         """Keep the rows up to ``first_update``; the file is replaced if that changes it."""
-        text = path.read_text(errors="replace")
+        text = path.read_text(encoding="utf-8", errors="replace")
         self._columns, rows = read_rows(text)
         kept = [row for row in rows if int(row["update"]) <= first_update]
         if kept and kept[-1].get("samples", "").isdigit():

@@ -25,14 +25,20 @@ def learning_rate(optimiser: torch.optim.Optimizer) -> Tensor:
 
 def optimiser_state(optimiser: torch.optim.Optimizer) -> dict[str, Any]:
     """Adam's state with string keys only, ready for a checkpoint; the learning rate is a number."""
+    state = live_state(optimiser)
+    rate = state["lr"]
+    return state | {"lr": decimal(rate.item()) if isinstance(rate, Tensor) else rate}
+
+
+def live_state(optimiser: torch.optim.Optimizer) -> dict[str, Any]:
+    """:func:`optimiser_state` without a wait for the device: its own tensors, the learning rate of :func:`adam` too."""
     state = optimiser.state_dict()
     moments = {str(index): entry for index, entry in state["state"].items()}
-    rate = state["param_groups"][0]["lr"]
-    return {"lr": decimal(rate.item()) if isinstance(rate, Tensor) else rate, "moments": moments}
+    return {"lr": state["param_groups"][0]["lr"], "moments": moments}
 
 
 def load_optimiser_state(optimiser: torch.optim.Optimizer, saved: dict[str, Any]) -> None:
-    """Inverse of :func:`optimiser_state`, for an optimiser over the same parameters.
+    """Inverse of :func:`optimiser_state` and of :func:`live_state`, for an optimiser over the same parameters.
 
     Tensors that it has stay the same: whoever steers the learning rate, and graphs, know them by address.
     """

@@ -7,8 +7,11 @@ import sys
 import time
 from collections import deque
 from collections.abc import Sequence
+from contextlib import suppress
 
 from tqdm import tqdm
+
+from pace.runs.files import tell
 
 SECONDS_PER_LINE = 15.0
 RATES = {  # column: label, factor, digits, unit
@@ -17,6 +20,8 @@ RATES = {  # column: label, factor, digits, unit
     "fall_rate": ("falls", 1.0, 3, "/s"),
     "predictor_rmse_cm": ("predictor", 1.0, 1, " cm"),
 }
+#: Column of a fault -> its total in words.
+FAULTS = {"diverged": "{} worlds diverged", "skipped": "{} updates skipped"}
 WINDOW = 25  # updates over which the shown rates are taken
 
 
@@ -54,6 +59,8 @@ class Progress:
         self.shown = tuple(shown)
         self.samples, self.seconds, self.first_samples = samples, seconds, first_samples
         self.recent: deque[dict[str, float]] = deque(maxlen=WINDOW)
+        #: Totals of the run's faults: worlds that diverged, updates that were skipped.
+        self.faults = dict.fromkeys(FAULTS, 0.0)
         self.started = time.monotonic()
         self._last_line = -math.inf
         self._enabled = enabled
@@ -64,16 +71,19 @@ class Progress:
     def show(self, row: dict[str, float]) -> None:
         """Add the row of one update and show the state of the run."""
         self.recent.append(row)
+        for name in FAULTS:
+            self.faults[name] += row.get(name, 0.0)
         if not self._enabled:
             return
         fraction, left = self._remaining(row["samples"])
         text = self._describe(row, left)
         if self._bar is not None:
-            self._bar.n = fraction
-            self._bar.set_description_str(text)
+            with suppress(OSError):  # the terminal is gone
+                self._bar.n = fraction
+                self._bar.set_description_str(text)
         elif time.monotonic() - self._last_line >= SECONDS_PER_LINE:
             self._last_line = time.monotonic()
-            print(f"{100 * fraction:3.0f} % | {text}", flush=True)
+            tell(f"{100 * fraction:3.0f} % | {text}")
 
     def say(self, text: str) -> None:
         """A line of its own, above the bar if there is one."""
@@ -100,8 +110,13 @@ class Progress:
             f"{self.mean('samples_per_s'):,.0f}/s",
             f"{clock(left)} left",
             *rate_texts(self.rates()),
+            *self.fault_texts(),
         ]
         return " | ".join(parts)
+
+    def fault_texts(self) -> list[str]:
+        """The run's faults in words; nothing without one."""
+        return [text.format(round(self.faults[name])) for name, text in FAULTS.items() if self.faults[name]]
 
     def rates(self) -> dict[str, float]:
         """The shown rates over the last updates."""
@@ -109,10 +124,11 @@ class Progress:
 
     def mean(self, name: str) -> float:
         """Mean of a column over the last updates, without NaN; NaN if no value is left."""
-        values = [row[name] for row in self.recent if not math.isnan(row[name])]
+        values = [row[name] for row in self.recent if not math.isnan(row.get(name, math.nan))]
         return sum(values) / len(values) if values else math.nan
 
     def close(self) -> None:
         """Close the bar."""
         if self._bar is not None:
-            self._bar.close()
+            with suppress(OSError):
+                self._bar.close()

@@ -23,7 +23,8 @@ from pace.config.automatic import left_open
 from pace.config.base import ConfigError, compose, parse, search_override, to_dict
 from pace.config.training import RESUME_KEYS, TrainConfig, load_train_config
 from pace.cores import core_set, usable_cores
-from pace.runs.checkpoint import list_checkpoints, read_meta
+from pace.runs.checkpoint import read_meta
+from pace.runs.checkpoint_folders import list_checkpoints
 from pace.runs.interrupt import StopRequest
 from pace.runs.metrics_file import LEADING
 from pace.runs.progress import SECONDS_PER_LINE, clock
@@ -166,7 +167,7 @@ class Job:
     def failure(self) -> str | None:
         """Why the run is not finished, once its process has ended; None if it is."""
         if self.process.returncode != 0:
-            lines = self.run.log.read_text(errors="replace").strip().splitlines()
+            lines = self.run.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
             return f"status {self.process.returncode}: {lines[-1] if lines else 'it printed nothing'}"
         return None if self.run.finished else f"ended at {self.run.saved_samples():,} control steps"
 
@@ -203,7 +204,7 @@ class RunQueue:
         )
 
     def play(self) -> None:
-        """Train the unfinished runs. Errors: ``KeyboardInterrupt`` when stopped by Ctrl-C or SIGTERM.
+        """Train the unfinished runs. Errors: ``KeyboardInterrupt`` when stopped by Ctrl-C, or :class:`Terminated`.
 
         The runs are then saved first; a second Ctrl-C does not wait for that.
         """
@@ -214,6 +215,7 @@ class RunQueue:
                 for job in self._active.values():
                     job.end(kill=True)
                 self._bar.close()
+        self._stop.require_not_terminated()
         if self._stop.name is not None:
             raise KeyboardInterrupt
 

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from itertools import count
@@ -22,12 +23,15 @@ from omegaconf.errors import OmegaConfBaseException
 
 from pace.config.base import ConfigError
 from pace.config.upgrade import FORMAT
-from pace.runs.checkpoint import clear_leftovers, list_checkpoints, update_of
+from pace.runs.checkpoint import Checkpoint, CheckpointError, save_checkpoint
+from pace.runs.checkpoint_folders import FOLDER, clear_leftovers, list_checkpoints, prune_checkpoints, update_of
 from pace.runs.files import reason, say, write_whole
 from pace.runs.metrics_file import FIRST_COLUMN, EventsFile, MetricsFile
 
 STAMP = "# format: "  # begins the first line of a run's configuration
 LOCK = ".lock"
+CHECKPOINTS_KEPT = 4
+REPLAYS, REPLAY_SUFFIX, MOST_REPLAYS = "replays", ".replay", 16
 CONFIG, VERSIONS, METRICS, EVENTS = "config.yaml", "versions.json", "metrics.csv", "events"
 PACKAGES = ("torch", "torchrl", "tensordict", "mujoco", "mujoco-warp", "warp-lang", "numpy", "hydra-core")
 LEFTOVER = re.compile(r"\.(config\.yaml|versions\.json|metrics\.csv)\.\d+\.tmp")  # of a kill while a file was written
@@ -192,6 +196,36 @@ class RunFolder:
         if self._events is not None:
             self._events.add(row)
 
+    def save(self, update: int, checkpoint: Checkpoint, last: bool = False) -> Path | None:
+        """Write the checkpoint of an update, and delete old ones; returns its folder.
+
+        One that cannot be written is told, and None: the run goes on, and the next one may fit.
+
+        Errors: :class:`CheckpointError` if the ``last`` one of the run cannot be written.
+        """
+        self.restore()
+        try:
+            folder = save_checkpoint(self.path / FOLDER / f"update_{update:08d}", checkpoint)
+        except CheckpointError as error:
+            if last:
+                raise
+            say(f"warning: {error}; training goes on, the last checkpoint stays")
+            return None
+        prune_checkpoints(self.path, CHECKPOINTS_KEPT)
+        return folder
+
+    def save_replay(self, update: int, write: Callable[[Path], Path]) -> None:
+        """Let ``write`` make the file of a replay; only the first :data:`MOST_REPLAYS` of a run are kept."""
+        folder = self.path / REPLAYS
+        if folder.is_dir() and len(list(folder.iterdir())) >= MOST_REPLAYS:
+            return
+        file = folder / f"update_{update:08d}{REPLAY_SUFFIX}"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            say(f"warning: numbers went wrong in update {update}; pace play {write(file)} shows the last steps")
+        except OSError as error:
+            say(f"warning: {file} cannot be written: {reason(error)}")
+
     def restore(self) -> None:
         """Make the folder again if it was deleted under the run, and say so. What was in it is lost."""
         if self.path.exists():
@@ -238,7 +272,7 @@ def _keys(file: Path) -> list[str]:
 def _first_line(file: Path) -> str:
     """The first line of a text file; nothing if it is no text."""
     try:
-        with file.open() as text:
+        with file.open(encoding="utf-8") as text:
             return text.readline()
     except (OSError, UnicodeDecodeError):
         return ""

@@ -112,7 +112,7 @@ def read_scene(path: Path) -> mujoco.MjSpec:
 
     Errors: :class:`ConfigError` for a file that MuJoCo cannot read.
     """
-    scene = (ASSETS / "scene.xml").read_text()
+    scene = (ASSETS / "scene.xml").read_text(encoding="utf-8")
     try:
         spec = mujoco.MjSpec.from_string(scene, include={"robot.xml": path.read_bytes()})
     except (OSError, ValueError) as error:

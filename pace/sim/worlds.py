@@ -20,9 +20,11 @@ from pace.sim.actuation import Actuation
 from pace.sim.ball.ball import BallParams, BallSim
 from pace.sim.ball.state import BallArrays, BallState
 from pace.sim.bodies import Bodies
+from pace.sim.divergence import Divergence
 from pace.sim.engine.factory import make_engine
 from pace.sim.kinematics import Kinematics
 from pace.sim.randomization import Randomizer, require_bodies
+from pace.sim.replay import Recorder
 from pace.sim.robot import build_model, nominal_pose
 from pace.sim.robot_spec import RobotSpec
 from pace.sim.robot_state import RobotArrays, RobotState
@@ -126,6 +128,10 @@ class Worlds(Stateful):
             self.kinematics.mount,
         )
         self.engine.apply_params(torch.ones(num_worlds, dtype=torch.bool, device=self.device))
+        flown = (self.ball, self.ball.events, self.ball.nearest_paddle_distance)
+        self.divergence = Divergence(self.engine, *flown, config.engine.largest_speed)
+        kept, joints = config.engine.remembered_steps, len(self.spec.joints)
+        self.recorder = Recorder(self.engine, self.ball, joints, kept, self.divergence.step) if kept else None
         self._warned = False
         self._allocate()
 
@@ -190,17 +196,22 @@ class Worlds(Stateful):
 
         Order: targets pass the actuator delay and the gears' play (:class:`pace.sim.actuation.Actuation`), pushes and
         the ball's last impulse on the paddle act, the robot moves, then the ball flies the same interval along the
-        paths of paddle and body. Its impulse on the body does not act back.
+        paths of paddle and body. Its impulse on the body does not act back. A robot or a ball whose numbers go wrong is
+        stopped (:class:`pace.sim.divergence.Divergence`); its world is then to be reset.
         """
+        if self.recorder is not None:
+            self.recorder.remember(targets)
         delayed = self.actuation(targets)
         if self.randomizer.pushes_enabled:
             self.engine.add_velocity(self.randomizer.update_push())
         if self.config.engine.paddle_reaction:
             self._react()
         self.engine.advance(delayed, self._applied)
+        self.divergence.stop_robots()
         self._observe()
         self._pose_bodies()
         self.ball.fly(self.kinematics.paddle_path)
+        self.divergence.stop_balls()
 
     def _react(self) -> None:
         """Distribute the ball's last impulse on the paddle over the coming control step.

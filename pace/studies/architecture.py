@@ -48,7 +48,9 @@ def read_rooms(root: Path = ROOT) -> dict[str, Room]:
             continue
         files = [file for file in path.rglob("*.py") if file not in commands] if folder else [path]
         named = set().union(*(set(_imported(file)) for file in files))
-        purpose = (ast.get_docstring(ast.parse((path / "__init__.py" if folder else path).read_text())) or "").strip()
+        purpose = (
+            ast.get_docstring(ast.parse((path / "__init__.py" if folder else path).read_text(encoding="utf-8"))) or ""
+        ).strip()
         inner = tuple(sorted(part.parent.name for part in path.glob("*/__init__.py")))
         found[path.stem] = Room(path.stem, _first_sentence(purpose), inner, frozenset(named - {path.stem, *LEFT_OUT}))
     return {name: Room(name, r.purpose, r.inner, r.imports & set(found)) for name, r in found.items()}
@@ -62,7 +64,7 @@ def _file(root: Path, module: str) -> Path:
 
 def _imported(file: Path) -> Iterator[str]:
     """Names of the rooms that a file imports, at any depth of it."""
-    for node in ast.walk(ast.parse(file.read_text())):
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom) and node.module:
             whole = [f"{node.module}.{alias.name}" for alias in node.names] if node.module == "pace" else [node.module]
         else:

@@ -42,7 +42,7 @@ class Tried:
 
 def listed(folder: Path) -> list[Tried]:
     """All lines of ``runs.csv`` in ``folder``."""
-    with (folder / "runs.csv").open(newline="") as file:
+    with (folder / "runs.csv").open(encoding="utf-8", newline="") as file:
         return [
             Tried(
                 row["recipe"],

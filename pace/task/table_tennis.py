@@ -14,8 +14,10 @@ from pace.config.task import TaskConfig
 from pace.onboard.actor import Predictor
 from pace.onboard.kinematics import PaddleChain
 from pace.sim.ball.state import BallState
+from pace.sim.replay import WorldReplay
 from pace.sim.sensing import Sensing
 from pace.sim.worlds import Worlds
+from pace.task.faults import Faults
 from pace.task.game import Game
 from pace.task.history import History
 from pace.task.observations import CRITIC, POLICY, layout
@@ -27,7 +29,7 @@ from pace.task.state import TaskState
 from pace.task.statistics import Statistics
 
 #: The environment's own part of its state; the rest belongs to its parts.
-OWN_TENSORS = ("predictor_target", "predictor_time_to_apex", "predictor_valid", "_bad")
+OWN_TENSORS = ("predictor_target", "predictor_time_to_apex", "predictor_valid")
 
 
 class TableTennis:
@@ -108,7 +110,8 @@ class TableTennis:
         ends = self.game.ends
         self.terminated, self.truncated = ends.lost, ends.truncated
         self.serve_over, self.serve_outcome, self.serve_hit = ends.over, ends.outcome, ends.hit
-        self._bad = torch.zeros_like(self._everyone)
+        histories = ((self._policy_history, self.policy_layout), (self._critic_history, self.critic_layout))
+        self.faults = Faults(self.worlds, self.game, self.rewards, histories)
         self.first_counted_serve, self._warmup_serves = torch.zeros((), device=device), 0
         self.statistics = Statistics(self.game, self.first_counted_serve)
 
@@ -160,7 +163,7 @@ class TableTennis:
         self._compute_truth()
         self._policy_history.push()
         self._critic_history.push()
-        self._flag_bad()
+        self.faults.flag()
 
     @torch.no_grad()
     def reset_worlds(self, mask: Tensor) -> None:
@@ -201,6 +204,7 @@ class TableTennis:
         self.game.judge()
         self._forecast_return(self.game.referee.hit_now)
         self.game.close()
+        self.faults.lose_diverged()
 
     def _start_serves(self, mask: Tensor, launched: Tensor, head_start: HeadStart | None = None) -> None:
         """Launch the sampled serves of ``launched`` (N,) bool. The others of ``mask`` wait: their ball, which is not
@@ -224,35 +228,24 @@ class TableTennis:
 
     # --- faults, statistics, state ------------------------------------------------------------------------------------
 
-    def _flag_bad(self) -> None:
-        """Remember the worlds in which a reward or an observation is not finite."""
-        total = self.reward + self._policy_history.frame.sum(1) + self._critic_history.frame.sum(1)
-        self._bad.logical_or_(total.isfinite().logical_not_())
+    def replays(self) -> list[WorldReplay]:
+        """See :meth:`pace.task.faults.Faults.replays`."""
+        return self.faults.replays()
 
     def warn_of_overflow(self) -> None:
         """See :meth:`pace.sim.worlds.Worlds.warn_of_overflow`."""
         self.worlds.warn_of_overflow()
 
     def first_bad(self) -> str | None:
-        """World and term of a value that was not finite, or None. Waits for the device: ask once an update."""
-        worlds = self._bad.nonzero()
-        if worlds.numel() == 0:
-            return None
-        world = int(worlds[0])
-        terms = self.rewards.values[:, world].isfinite().tolist()
-        bad = [f"reward term '{name}'" for name, finite in zip(self.rewards.names, terms, strict=True) if not finite]
-        groups = ((self._policy_history, self.policy_layout), (self._critic_history, self.critic_layout))
-        for history, columns in groups:
-            finite = history.frames[world].isfinite().all(0)
-            bad += [f"observation '{name}'" for name, where in columns.items() if not bool(finite[where].all())]
-        # the fault of an earlier step may have gone from the last values
-        return f"{bad[0] if bad else 'a reward or an observation'} of world {world} is not finite"
+        """See :meth:`pace.task.faults.Faults.first`."""
+        return self.faults.first()
 
     def pop_statistics(self) -> dict[str, Tensor]:
         """Sums over worlds and steps since the last call, 0-d tensors: see :class:`pace.task.statistics.Statistics`;
-        ``reward_sum`` and ``reward/<term>`` as the learner sees them."""
+        ``diverged`` worlds, which were reset because their numbers went wrong; ``reward_sum`` and ``reward/<term>`` as
+        the learner sees them."""
         terms = self.rewards.pop_sums()
-        sums = self.statistics.pop()
+        sums = self.statistics.pop() | {"diverged": self.worlds.divergence.pop_count()}
         sums["reward_sum"] = torch.stack(list(terms.values())).sum() if terms else torch.zeros_like(self.reward[0])
         return sums | {f"reward/{name}": value for name, value in terms.items()}
 
@@ -271,7 +264,8 @@ class TableTennis:
 
     def _own_state(self) -> dict[str, Tensor]:
         """Of the environment itself, and what the robot computes on board, whose names the estimates give."""
-        return with_prefix("env", tensors_named(self, OWN_TENSORS)) | self.actor.computed()
+        own = tensors_named(self, OWN_TENSORS) | {"_bad": self.faults.bad}
+        return with_prefix("env", own) | self.actor.computed()
 
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:  # type: ignore[override]
         """Everything that the next step depends on, as copies: tensors by name, and ``generator``.

@@ -8,13 +8,16 @@ from pathlib import Path
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from pace.config.base import parse
+from pace.config.base import ConfigError, parse
 from pace.config.commands import PlayConfig
 from pace.evaluation.sweep import ball_presets
 from pace.rl.policies import TaskPolicy, load_policy
 from pace.runs.progress import SECONDS_PER_LINE
+from pace.runs.run_folder import REPLAY_SUFFIX
 from pace.viewer.playback import Show
-from pace.viewer.video import write_video
+from pace.viewer.replay import ReplayPage, load_show
+from pace.viewer.server import require_viewer
+from pace.viewer.video import Shown, write_video
 from pace.viewer.web import Page
 
 
@@ -22,10 +25,13 @@ def play_from_config(composed: DictConfig) -> None:
     """Play as configured, and print the address or the file."""
     config = parse(composed, PlayConfig)
     assert config.run is not None  # guaranteed by PlayConfig
+    if config.run.endswith(REPLAY_SUFFIX):
+        replay(config)
+        return
     policy = load_policy(config.run)
     overrides = [f"engine.physics_dt={config.physics_dt}", *config.overrides]
     if config.video:
-        film(config, policy, overrides)
+        film(config, Show(policy, overrides, config.seed), f"policy {policy.source}")
     else:
         page(config, policy, overrides)
 
@@ -40,16 +46,34 @@ def page(config: PlayConfig, policy: TaskPolicy, overrides: list[str]) -> None:
         print("\nended")
 
 
-def film(config: PlayConfig, policy: TaskPolicy, overrides: list[str]) -> None:
+def replay(config: PlayConfig) -> None:
+    """Show what went wrong in a training run, on the page or in a video of ``seconds``."""
+    assert config.run is not None
+    if config.overrides:
+        raise ConfigError("a replay shows what was: it takes no changes of the task")
+    show = load_show(Path(config.run))
+    if config.video:
+        film(config, show, f"replay {config.run}")
+        return
+    require_viewer()
+    shown = ReplayPage(show, config.host, config.port)
+    print(f"replay {config.run}\nopen {shown.url} in a browser; Ctrl-C ends it", flush=True)
+    try:
+        shown.run()
+    except KeyboardInterrupt:
+        print("\nended")
+
+
+def film(config: PlayConfig, show: Shown, about: str) -> None:
     """Write the video."""
     assert config.video
-    file, show = Path(config.video), Show(policy, overrides, config.seed)
+    file = Path(config.video)
     total = round(config.seconds * config.fps / config.speed)
     size = (config.width, config.height)
     interval = 0.2 if sys.stderr.isatty() else SECONDS_PER_LINE
     with tqdm(total=total, desc=file.name, unit="picture", mininterval=interval) as bar:
         write_video(file, show, config.seconds, config.fps, config.speed, *size, on_picture=lambda: _tick(bar))
-    print(f"policy {policy.source}\n{show.score.text()}\nwrote {file}")
+    print(f"{about}\n{show.text()}\nwrote {file}")
 
 
 def _tick(bar: tqdm) -> None:

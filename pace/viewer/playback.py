@@ -208,6 +208,15 @@ class Show:
         self.env.chosen.choice = serve
 
     @property
+    def config(self) -> TaskConfig:
+        """The task that is played."""
+        return self.env.config
+
+    def text(self) -> str:
+        """The score in one line."""
+        return self.score.text()
+
+    @property
     def control_dt(self) -> float:
         """s between control steps."""
         return self.env.worlds.control_dt

@@ -5,16 +5,35 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from itertools import chain
 from pathlib import Path
+from typing import Protocol
 
 import mujoco
 import numpy as np
 
+from pace.config.sim import SimConfig
 from pace.sim.render import Picture, RenderError, SceneRenderer, caption, top_camera
 from pace.sim.robot import build_model
-from pace.viewer.playback import Show
+from pace.viewer.playback import Snapshot
 
 TOP = (-0.75, 0.0, 4.2)  # m: x, y and height of the camera
 BLOCK = 2  # pixels: the codec halves the colours' resolution
+
+
+class Shown(Protocol):
+    """What a video shows: a :class:`pace.viewer.playback.Show`, or a replay."""
+
+    @property
+    def config(self) -> SimConfig:
+        """Robot and table."""
+        ...
+
+    def advance(self, seconds: float) -> Snapshot:
+        """The state after ``seconds`` more."""
+        ...
+
+    def text(self) -> str:
+        """What is written into the pictures, in parts that " | " separates."""
+        ...
 
 
 def side_camera() -> mujoco.MjvCamera:
@@ -25,24 +44,24 @@ def side_camera() -> mujoco.MjvCamera:
     return camera
 
 
-def pictures(show: Show, seconds: float, fps: int, speed: float, width: int, height: int) -> Iterator[Picture]:
+def pictures(show: Shown, seconds: float, fps: int, speed: float, width: int, height: int) -> Iterator[Picture]:
     """``seconds`` of play at ``fps`` frames a second of video, time slowed by ``speed``: uint8 (2 height, width, 3).
 
     Errors: :class:`pace.sim.render.RenderError` without OpenGL.
     """
-    config = show.env.config
+    config = show.config
     model = build_model(config.robot, config.engine, config.ball.table, visual=True)
     with SceneRenderer(model, width, height) as renderer:
         for _ in range(max(1, round(seconds * fps / speed))):
             snapshot = show.advance(speed / fps)
             renderer.set_state(snapshot.qpos, snapshot.ball)
             views = [renderer.draw(camera, snapshot.marks()) for camera in (side_camera(), top_camera(*TOP))]
-            yield caption(np.concatenate(views), show.score.text().replace(" | ", "\n"))
+            yield caption(np.concatenate(views), show.text().replace(" | ", "\n"))
 
 
 def write_video(
     file: Path,
-    show: Show,
+    show: Shown,
     seconds: float,
     fps: int,
     speed: float,

@@ -6,42 +6,24 @@ out and draws.
 
 from __future__ import annotations
 
-import socket
 import time
 from collections.abc import Callable, Sequence
-from contextlib import redirect_stdout
-from io import StringIO
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import Any
 
-import mujoco
-import numpy as np
-
-from pace.config.base import ConfigError
+from pace.config.base import ConfigError, printable
 from pace.rl.policies import TaskPolicy, load_policy
-from pace.runs.checkpoint import FOLDER, CheckpointError, list_checkpoints
-from pace.sim.render import Colour
-from pace.sim.robot import build_model
-from pace.viewer.playback import (
-    APEX_COLOUR,
-    APEX_RADIUS,
-    BASE_COLOUR,
-    BASE_RADIUS,
-    FLIGHT_COLOUR,
-    FLIGHT_WIDTH,
-    PREDICTION_COLOUR,
-    PREDICTION_RADIUS,
-    Serve,
-    Show,
-    Snapshot,
-)
+from pace.runs.checkpoint import CheckpointError
+from pace.runs.checkpoint_folders import FOLDER, list_checkpoints
+from pace.viewer.playback import Serve, Show, Snapshot
+from pace.viewer.scene import BrowserScene
+from pace.viewer.server import number, open_server, require_port, require_viewer
 
 FRAME = 1.0 / 30.0  # s between pictures
 LONGEST_FRAME = 0.1  # s: a page does not catch up after a longer delay
+SLOWEST = 0.05  # speed of time, unless the user asks for less
 IDLE = 0.1  # s between checks for a connected browser
 LOOK_FOR_CHECKPOINTS = 5.0  # s: a training run may write new ones
-CAMERA, LOOK_AT = (-2.9, -2.6, 1.7), (-0.7, 0.0, 0.8)  # m, the first view
 #: Sliders of a serve: label, least, largest, step, start, hint. In the order of :class:`Serve`.
 SERVE_SLIDERS = (
     ("Speed (m/s)", 4.5, 7.5, 0.05, 5.8, "over the ground"),
@@ -53,30 +35,6 @@ SERVE_SLIDERS = (
 LEGEND = (
     "Green: apex of the flight. Yellow: the predictor's. Blue: where the base should stand. Line: the flight ahead."
 )
-
-
-class PageError(RuntimeError):
-    """A page that cannot be shown; the message says why."""
-
-
-def require_viewer() -> None:
-    """Errors: :class:`PageError` if the packages of the page are missing."""
-    try:
-        import mjviser
-    except ImportError as error:
-        raise PageError(f"{error}: pip install 'pace-table-tennis[viewer]'") from error
-    del mjviser
-
-
-def require_port(host: str, port: int) -> None:
-    """Errors: :class:`PageError` if ``port`` of ``host`` is in use or may not be opened."""
-    try:
-        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
-        socket.create_server((host, port), family=family).close()
-    except (OSError, OverflowError) as error:
-        raise PageError(
-            f"port {port} of {host} cannot be opened ({error}): give another port=, or end what uses it"
-        ) from error
 
 
 def checkpoints_of(policy: TaskPolicy) -> list[Path]:
@@ -94,11 +52,11 @@ class Page:
         policy: as :func:`pace.rl.load_policy` gives it.
         overrides: of the saved task.
         balls: names of ball presets to choose from.
-        host, port: to listen on. With another host than the local one, everybody in its network has the controls.
+        host, port: to listen on. With another host than the local one, who has the token in ``url`` has the controls.
         speed: of time, 1 for real time.
         seed: of all random numbers.
 
-    Errors: :class:`PageError`; :class:`pace.config.ConfigError` for wrong overrides.
+    Errors: :class:`pace.viewer.server.PageError`; :class:`pace.config.ConfigError` for wrong overrides.
     """
 
     def __init__(
@@ -113,65 +71,21 @@ class Page:
     ) -> None:
         require_viewer()
         require_port(host, port)
-        import viser
-
         self._overrides, self._seed = list(overrides), seed
+        self._balls = tuple(balls)
         self._ball: str | None = None  # that of the overrides, or of the saved task
         self._policy = policy
         self._requests: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self.show = Show(policy, overrides, seed)
-        with redirect_stdout(StringIO()):  # hides its banner
-            self.server = viser.ViserServer(host=host, port=port, label="PACE", verbose=False)
-        if self.server.get_port() != port:  # another process took it first
-            self.server.stop()
-            raise PageError(f"port {port} of {host} was taken just now: give another port=")
-        self.url = f"http://{host}:{port}"
-        self._build_scene()
+        self.server, self.url = open_server(host, port)
+        self._scene = BrowserScene(self.server, self.show.config)
         self._build_controls(balls, speed)
-        self._drawn_flight = 0
         self._next_look = 0.0
-
-    # --- scene --------------------------------------------------------------------------------------------------------
-
-    def _build_scene(self) -> None:
-        from mjviser import ViserMujocoScene
-
-        config = self.show.env.config
-        model = build_model(config.robot, config.engine, config.ball.table, visual=True)
-        self._data = mujoco.MjData(model)
-        self._scene = ViserMujocoScene(self.server, model, num_envs=1)
-        self._scene.camera_tracking_enabled = False  # the marks are in the world's frame
-        self.server.initial_camera.position, self.server.initial_camera.look_at = CAMERA, LOOK_AT
-        self._marks = {
-            "apex": self._mark("apex", APEX_RADIUS, APEX_COLOUR),
-            "prediction": self._mark("prediction", PREDICTION_RADIUS, PREDICTION_COLOUR),
-            "base_target": self._mark("base_target", BASE_RADIUS, BASE_COLOUR),
-        }
-
-    def _mark(self, name: str, radius: float, colour: Colour) -> Any:
-        return self.server.scene.add_icosphere(f"/marks/{name}", radius, _rgb(colour), cast_shadow=False)
 
     def draw(self, snapshot: Snapshot) -> None:
         """Send all changes to the browsers."""
-        self._data.qpos[:] = snapshot.qpos
-        self._data.mocap_pos[0] = snapshot.ball
-        mujoco.mj_kinematics(self._scene.mj_model, self._data)
-        with self.server.atomic():
-            for name, handle in self._marks.items():
-                place = getattr(snapshot, name)
-                handle.visible = place is not None
-                if place is not None:
-                    handle.position = place
-            if snapshot.flight_number != self._drawn_flight:
-                self._drawn_flight = snapshot.flight_number
-                self._draw_flight(snapshot)
-            self._scene.update_from_mjdata(self._data)
-        self._say(self.show.score.text())
-
-    def _draw_flight(self, snapshot: Snapshot) -> None:
-        pieces = np.stack((snapshot.flight[:-1], snapshot.flight[1:]), axis=1)
-        look = {"thickness": FLIGHT_WIDTH, "thickness_units": "screen"}
-        self.server.scene.add_line_segments("/marks/flight", pieces, _rgb(FLIGHT_COLOUR), **look)
+        self._scene.draw(snapshot)
+        self._say(self.show.text())
 
     def _say(self, text: str) -> None:
         if self._score.content != text:
@@ -183,12 +97,13 @@ class Page:
         gui = self.server.gui
         gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
         gui.main_panel.dock_right()
-        self._score = gui.add_markdown(self.show.score.text())
+        self._score = gui.add_markdown(self.show.text())
         next_serve = gui.add_button("Next serve")
         next_serve.on_click(lambda _: self._ask(lambda: self.show.next_serve(self.serve)))
         ball = gui.add_button_group("Ball", tuple(balls))
         ball.on_click(lambda _: self._ask(lambda: self._change_ball(ball.value)))
-        self._time = gui.add_slider("Speed of time", min=0.05, max=1.0, step=0.05, initial_value=speed)
+        least = min(SLOWEST, speed)
+        self._time = gui.add_slider("Speed of time", min=least, max=1.0, step=least, initial_value=speed)
         self._build_serve()
         self._checkpoint = gui.add_dropdown("Checkpoint", self._names(), initial_value=Path(self._policy.source).name)
         self._checkpoint.on_update(lambda _: self._ask(lambda: self._change_checkpoint(self._checkpoint.value)))
@@ -213,13 +128,16 @@ class Page:
     @property
     def serve(self) -> Serve | None:
         """The serve of the sliders, or ``None`` for random serves."""
-        return None if self._random.value else Serve(*(float(slider.value) for slider in self._sliders))
+        if self._random.value:
+            return None
+        starts = (slider[4] for slider in SERVE_SLIDERS)
+        return Serve(*(number(*each) for each in zip(self._sliders, starts, strict=True)))
 
     def _ask(self, request: Callable[[], None]) -> None:
         self._requests.put(request)
 
     def _describe(self) -> str:
-        config, policy = self.show.env.config, self._policy
+        config, policy = self.show.config, self._policy
         samples = policy.counters.get("samples", 0.0)
         return f"{Path(policy.source).name}, {samples / 1e6:.1f} M samples; ball {config.ball.name}"
 
@@ -228,11 +146,18 @@ class Page:
     def _names(self) -> tuple[str, ...]:
         return tuple(folder.name for folder in reversed(checkpoints_of(self._policy)))
 
-    def _change_ball(self, name: str) -> None:
-        self._restart(self._policy, name)
+    def _change_ball(self, name: object) -> None:
+        if name in self._balls:
+            self._restart(self._policy, str(name))
+        else:
+            self._refuse(name)
 
-    def _change_checkpoint(self, name: str) -> None:
+    def _change_checkpoint(self, name: object) -> None:
+        """Only a name that the page itself has listed: a browser may send any path."""
         if name == Path(self._policy.source).name:
+            return
+        if not isinstance(name, str) or name not in self._names():
+            self._refuse(name)
             return
         try:
             policy = load_policy(Path(self._policy.source).with_name(name))
@@ -240,6 +165,9 @@ class Page:
             self._status.content = f"**{error}**"
             return
         self._restart(policy, self._ball)
+
+    def _refuse(self, name: object) -> None:
+        self._status.content = f"**{printable(str(name)[:40])} does not exist**"
 
     def _restart(self, policy: TaskPolicy, ball: str | None) -> None:
         """Start a new show, with a new score, for another policy or another ball."""
@@ -251,7 +179,7 @@ class Page:
             return
         self._policy, self._ball = policy, ball
         self.show.choose(self.serve)
-        self._drawn_flight = 0
+        self._scene.forget_flight()
         self._status.content = self._describe()
 
     def _look_for_checkpoints(self) -> None:
@@ -283,11 +211,6 @@ class Page:
                 break
         self._look_for_checkpoints()
         if self.server.get_clients():
-            self.draw(self.show.advance(elapsed * self._time.value))
+            self.draw(self.show.advance(elapsed * number(self._time, 1.0)))
         else:
             time.sleep(IDLE)
-
-
-def _rgb(colour: Colour) -> tuple[int, int, int]:
-    red, green, blue, _ = (round(255 * part) for part in colour)
-    return red, green, blue

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import runpy
 import subprocess
 import sys
@@ -12,6 +14,8 @@ from pkgutil import resolve_name
 import pytest
 
 from pace.__main__ import main
+from pace.command import Terminated, run_command
+from pace.command.arguments import quote
 from pace.command.help import WIDTH, command_help, command_keys
 from pace.command.keys import file_keys, heading
 from pace.command.table import COMMANDS, Command
@@ -240,3 +244,43 @@ def test_pace_is_a_console_script() -> None:
 def test_work_and_failures_of_a_command_are_there(command: Command) -> None:
     assert callable(resolve_name(command.work))
     assert all(issubclass(resolve_name(path), Exception) for path in command.failures)
+
+
+PATHS = (
+    "my run", "Läufe/卓球 1.", "a=b, c", "it's", 'say "x"', "back\\slash", "end\\", "1e3", "true", "[x]", "{a: 1}",
+    "~/x", "$x", "a#b", "%d", "(½)", ":x", "a  b", "\t", "Straße\u0301",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("path", PATHS)
+@pytest.mark.parametrize("quoted", [False, True])
+def test_a_path_arrives_as_it_is_written(path: str, quoted: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also in a worker, which is started with the arguments that Hydra got."""
+    found: list[str] = []
+    monkeypatch.setattr("pace.command.run.resolve_name", lambda _: lambda config: found.append(config.out))
+    monkeypatch.setattr(sys, "argv", ["evaluate", "run", f"out={quote(path) if quoted else path}"])
+    assert run_command("evaluate") == 0
+    assert run_command("evaluate") == 0
+    assert found == [path, path]
+
+
+@pytest.mark.parametrize(("number", "status"), [(errno.ENOSPC, 1), (errno.EROFS, 1), (errno.EACCES, 1)])
+def test_a_disk_that_cannot_be_written_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], number: int, status: int
+) -> None:
+    def work(config: object) -> None:
+        raise OSError(number, os.strerror(number), "out/table.csv")
+
+    monkeypatch.setattr("pace.command.run.resolve_name", lambda _: work)
+    monkeypatch.setattr(sys, "argv", ["validate"])
+    assert run_command("validate") == status
+    assert capsys.readouterr().err == f"error: out/table.csv: {os.strerror(number)}\n"
+
+
+def test_a_terminated_command_has_its_own_status(monkeypatch: pytest.MonkeyPatch) -> None:
+    def work(config: object) -> None:
+        raise Terminated
+
+    monkeypatch.setattr("pace.command.run.resolve_name", lambda _: work)
+    monkeypatch.setattr(sys, "argv", ["validate"])
+    assert run_command("validate") == 75

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import csv
+import errno
 import json
 import math
+import os
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -18,8 +21,8 @@ from pace.config.overrides import override_task
 from pace.evaluation import evaluate, sweep
 from pace.evaluation.__main__ import main
 from pace.evaluation.records import COLUMNS, C, count_failures, summarise, wilson
-from pace.evaluation.report import clean
-from pace.evaluation.serves import ServeRecorder, evaluate_row
+from pace.evaluation.report import clean, write_json
+from pace.evaluation.serves import Row, ServeRecorder, evaluate_row
 from pace.evaluation.sweep import Variation, ball_presets, plan_cell, variations
 from pace.evaluation.text import text_table
 from pace.predictor.regression import BIN_NAMES
@@ -444,3 +447,38 @@ def test_changes_of_the_task_are_collected() -> None:
 def test_columns_line_up() -> None:
     table = text_table(("serve", "n"), [["mid_long", "7"], ["a", "1,000"]])
     assert table.splitlines() == ["serve         n", "--------  -----", "mid_long      7", "a         1,000"]
+
+
+def test_an_evaluation_that_is_stopped_in_its_second_row_keeps_the_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played: list[str] = []
+
+    def play(*arguments: Any, **options: Any) -> Row:
+        if played:
+            raise KeyboardInterrupt
+        row = evaluate_row(*arguments, **options)
+        played.append(row.serve)
+        return row
+
+    monkeypatch.setattr(evaluate, "evaluate_row", play)
+    small = ["serves=2", "num_worlds=2", "warmup_serves=0", "physics_dt=0.02", "serve.max_duration=0.3"]
+    command = ["policy=zero", "rows=[short,mixed]", f"out={tmp_path}", "progress=false", "device=cpu", *small]
+    assert run_main(monkeypatch, *command) == 130
+    rows = json.loads((tmp_path / "evaluation.json").read_text())["rows"]
+    assert [(row["serve"], row["serves"] >= 2) for row in rows] == [("short", True)]
+    assert len((tmp_path / "evaluation.csv").read_text().splitlines()) == 2
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_a_full_disk_leaves_the_cells_of_a_sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "sweep.json").write_text('{"cells": "those that are finished"}')
+
+    def full(handle: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        write_json(tmp_path / "sweep.json", {"cells": []})
+    assert json.loads((tmp_path / "sweep.json").read_text()) == {"cells": "those that are finished"}
+    assert [file.name for file in tmp_path.iterdir()] == ["sweep.json"]

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl.data import Unbounded
 
 from pace.arrays.graph import Graphs
+from pace.sim.replay import WorldReplay
 
 STATE = (
     "position", "target", "ball", "ball_velocity", "age", "policy_observation", "critic_observation", "predictor_input",
@@ -106,6 +107,10 @@ class DummyTask:
     def first_bad(self) -> str | None:
         bad = (~torch.isfinite(self.policy_observation)).any(1).nonzero()
         return f"term position of world {int(bad[0])}" if len(bad) else None
+
+    def replays(self) -> list[WorldReplay]:
+        """Nothing is remembered here."""
+        return []
 
     def warn_of_overflow(self) -> None:
         """Nothing can overflow here."""

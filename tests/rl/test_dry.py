@@ -120,6 +120,24 @@ def test_a_trainer_that_has_graphs_resumes_with_them() -> None:
     assert differing(*ends) == []
 
 
+@pytest.mark.parametrize("spoilt", [0, 1, 2, 4])
+def test_an_update_that_is_undone_leaves_the_graphs_as_they_are(spoilt: int) -> None:
+    """It may be the one that warms up, that is recorded, or that is replayed; what is put back is what they read."""
+    ends = []
+    for graphs in (Graphs.DRY, Graphs.NONE):
+        trainer = trainer_of(small_config(), graphs)
+        for number in range(7):
+            before = {name: value.clone() for name, value in trainer.agent.state_dict().items()}
+            if number == spoilt:
+                trainer.env.critic_observation[3, 1] = torch.nan
+            row = trainer._safe_update()
+            assert row["skipped"] == float(number == spoilt)
+            assert (differing(before, trainer.agent.state_dict()) == []) == (number == spoilt)
+        ends.append(state_of(trainer.checkpoint()))
+    assert differing(*ends) == []
+    assert all(bool(value.isfinite().all()) for name, value in ends[0].items() if name.startswith("weights"))
+
+
 def test_a_rollout_in_the_place_of_another_has_its_own_graphs() -> None:
     """Python gives the id of an object that is gone to another one."""
     config, ends = small_config().algo, []

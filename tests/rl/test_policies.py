@@ -16,7 +16,8 @@ from pace.config.overrides import override_task
 from pace.config.training import load_train_config
 from pace.rl import policies as loading
 from pace.rl.policies import built_in_policy, load_policy, policy_size
-from pace.runs.checkpoint import META, WEIGHTS, CheckpointError, list_checkpoints
+from pace.runs.checkpoint import META, WEIGHTS, CheckpointError
+from pace.runs.checkpoint_folders import list_checkpoints
 from tests.helpers.saved import make_agent, make_config, save_run
 
 

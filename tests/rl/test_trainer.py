@@ -21,7 +21,8 @@ from pace.rl.ppo import AsymmetricPPO
 from pace.rl.rates import rates
 from pace.rl.rollout import Rollout, RolloutError
 from pace.rl.trainer import Trainer
-from pace.runs.checkpoint import CheckpointError, list_checkpoints, load_checkpoint
+from pace.runs.checkpoint import CheckpointError, load_checkpoint
+from pace.runs.checkpoint_folders import list_checkpoints
 from pace.runs.metrics import read_metrics
 from pace.runs.run_folder import RunFolder
 from tests.helpers.algo import IN_SAMPLES
@@ -200,7 +201,7 @@ def test_rows_after_the_checkpoint_are_replaced_by_a_resume(tmp_path: Path) -> N
     assert read_metrics(tmp_path / "metrics.csv")["samples"] == [UPDATE, 2 * UPDATE, 3 * UPDATE]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_the_run_with_a_checkpoint(tmp_path: Path, number: signal.Signals) -> None:
     trainer = make_trainer(tmp_path, updates=1000)
     advance = trainer.env.advance
@@ -226,6 +227,7 @@ def test_a_signal_ends_the_run_with_a_checkpoint(tmp_path: Path, number: signal.
 
 def test_a_nan_keeps_the_last_good_checkpoint(tmp_path: Path) -> None:
     trainer = make_trainer(tmp_path, updates=10, checkpoint_minutes=0.0)
+    trainer.config.algo.skips = 0
     trainer.env.poison_step = 30  # type: ignore[attr-defined]
     with pytest.raises(RolloutError, match="column 1 of world 3 "):
         trainer.train()

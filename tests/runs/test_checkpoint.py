@@ -18,17 +18,14 @@ from pace.runs.checkpoint import (
     WEIGHTS,
     Checkpoint,
     CheckpointError,
-    clear_leftovers,
     export_weights,
     find_checkpoint,
     flatten_tensors,
-    list_checkpoints,
     load_checkpoint,
     load_weights,
-    prune_checkpoints,
     save_checkpoint,
-    update_of,
 )
+from pace.runs.checkpoint_folders import clear_leftovers, list_checkpoints, prune_checkpoints, update_of
 
 
 def example(value: float = 1.0) -> Checkpoint:

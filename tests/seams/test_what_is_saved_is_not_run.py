@@ -13,7 +13,8 @@ from pace.config.base import ConfigError
 from pace.deploy.__main__ import main as export
 from pace.evaluation.__main__ import main as evaluate
 from pace.rl.policies import load_policy, load_predictor
-from pace.runs.checkpoint import META, CheckpointError, list_checkpoints
+from pace.runs.checkpoint import META, CheckpointError
+from pace.runs.checkpoint_folders import list_checkpoints
 from tests.helpers.outside import command, stranger, write_module
 from tests.helpers.saved import save_run
 

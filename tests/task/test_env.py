@@ -293,7 +293,7 @@ def test_physics_runs_on_sensible_numbers(shared: TableTennisEnv) -> None:
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (lambda env: env.worlds.ball.position[5].fill_(torch.nan), "world 5 is not finite"),
+        (lambda env: env.sensing._line[5].fill_(torch.nan), "world 5 is not finite"),
         (lambda env: env.task_state.action[3].fill_(torch.nan), "reward term 'action_rate' of world 3 is not finite"),
     ],
 )

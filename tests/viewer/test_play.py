@@ -20,7 +20,7 @@ from pace.config.base import ConfigError, compose, parse
 from pace.config.commands import ExportConfig, PlayConfig
 from pace.deploy.export import ExportError, export_policy
 from pace.rl.policies import TaskPolicy, built_in_policy, load_policy
-from pace.runs.checkpoint import list_checkpoints
+from pace.runs.checkpoint_folders import list_checkpoints
 from pace.sim import render
 from pace.sim.ball.ball import ball_preset
 from pace.sim.render import RenderError
@@ -182,7 +182,7 @@ def test_bad_input_is_one_line(
 
 
 def test_missing_packages_are_named(monkeypatch: pytest.MonkeyPatch, policy: TaskPolicy, tmp_path: Path) -> None:
-    from pace.viewer.web import PageError, require_viewer
+    from pace.viewer.server import PageError, require_viewer
 
     monkeypatch.setitem(sys.modules, "mjviser", None)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
@@ -252,7 +252,8 @@ def test_the_page_in_a_browser(page: tuple, port: int, tmp_path: Path) -> None:
 
 def test_controls_of_the_page(policy: TaskPolicy, port: int) -> None:
     pytest.importorskip("mjviser")
-    from pace.viewer.web import Page, PageError, checkpoints_of
+    from pace.viewer.server import PageError
+    from pace.viewer.web import Page, checkpoints_of
 
     shown = Page(policy, QUICK, ["paper", "rubber"], port=port)
     try:
@@ -281,6 +282,16 @@ def test_controls_of_the_page(policy: TaskPolicy, port: int) -> None:
         assert "does not exist" in shown._status.content
     finally:
         shown.server.stop()
+
+
+@pytest.mark.parametrize("speed", [0.04, 0.001, 0.07, 1.0])
+def test_a_page_begins_at_any_speed_of_time(policy: TaskPolicy, port: int, speed: float) -> None:
+    pytest.importorskip("mjviser")
+    from pace.viewer.web import Page
+
+    shown = Page(policy, QUICK, ["paper"], port=port, speed=speed)
+    assert shown._time.value == speed
+    shown.server.stop()
 
 
 def test_the_saved_task_is_played() -> None:

@@ -123,13 +123,17 @@ def first_contact(
     arc: Arc,
     gaps: Gaps,
     end_gaps: Gaps,
+    surfaces: int,
     speed: float,
     robot_speed: float,
     radius: float,
     scene: Scene,
     world: int,
 ) -> Contact:
-    """The earliest contact on an arc; ``speed`` bounds the ball's, ``robot_speed`` that of paddle and body (m/s)."""
+    """The earliest contact with the first ``surfaces`` surfaces on an arc.
+
+    ``speed`` bounds the ball's, ``robot_speed`` that of paddle and body (m/s).
+    """
     first = Contact()
     first.surface = NOTHING
     first.time = 2.0 * arc.duration
@@ -144,7 +148,7 @@ def first_contact(
             relative += robot_speed
         gap = gaps[surface]
         end_gap = end_gaps[surface]
-        if may_touch(gap, end_gap, relative, arc.duration):
+        if surface < surfaces and may_touch(gap, end_gap, relative, arc.duration):
             contact = contact_with(surface, arc, gap, end_gap, radius, scene, world)
             if contact.surface != NOTHING and contact.time < first.time:
                 first = contact

@@ -116,7 +116,7 @@ def fly_leg(
     speed = wp.length(flight.velocity) + GRAVITY * longest
     arc = free_arc(flight, body, scene, substep_length(flight.gaps, speed, robot_speed, remaining, longest))
     end_gaps = gaps_to(surfaces, arc.end, arc.clock + arc.duration, body.radius, scene, world)
-    contact = first_contact(arc, flight.gaps, end_gaps, speed, robot_speed, body.radius, scene, world)
+    contact = first_contact(arc, flight.gaps, end_gaps, surfaces, speed, robot_speed, body.radius, scene, world)
     leg = Leg()
     leg.surface = contact.surface
     if contact.surface != NOTHING:

@@ -37,6 +37,7 @@ class NativeEngine(StateTensors):
             raise ConfigError(f"engine native runs on the CPU, not on {device}: use device=cpu or engine=mjwarp")
         super().__init__(model, num_worlds, device, substeps, engine.physics_dt)
         stop_timers()
+        mujoco.set_mju_user_warning(_ignore)
         model = copy.copy(model)
         # a state that is not finite stays so and is detected; MuJoCo would reset that robot silently
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
@@ -85,6 +86,13 @@ class NativeEngine(StateTensors):
     def overflowed(self) -> bool:
         full = [int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_CNSTRFULL)]
         return bool(self._batch.warning[:, full, 1].any())  # mjWarningStat: last info, number
+
+
+def _ignore(_: str) -> None:
+    """In place of MuJoCo's warnings, which it prints, and appends to a file in the user's folder.
+
+    Divergence and full buffers are seen without them: :class:`pace.sim.divergence.Divergence`, ``overflowed``.
+    """
 
 
 def stop_timers() -> None:
