@@ -34,7 +34,7 @@ from pace.evaluation.sweep import (
     variations,
     write_sweep,
 )
-from pace.evaluation.task import policy_on, task_line
+from pace.evaluation.task import own_pauses, policy_on, task_line
 from pace.rl.policies import TaskPolicy, built_in_policy, load_policy
 from pace.runs.progress import SECONDS_PER_LINE, clock
 from pace.runs.run_folder import make_out, versions
@@ -47,7 +47,8 @@ def evaluate_from_config(composed: DictConfig) -> None:
     config = parse(composed, EvaluateConfig)
     saved = choose_policy(config)
     policy = policy_on(config.task, saved)
-    overrides = [f"engine.physics_dt={config.physics_dt}", *config.overrides]
+    pauses = own_pauses(config.task, saved.config)
+    overrides = [f"engine.physics_dt={config.physics_dt}", *pauses, *config.overrides]
     context = circumstances(config, policy, overrides)
     task = override_task(policy.config, overrides)
     told = task_line(config.task, saved.config, task)
