@@ -26,15 +26,15 @@ from pace.evaluation.serves import MakeRecorder, OnCount, Row, evaluate_row
 from pace.evaluation.sweep import (
     Cell,
     Tables,
-    Variation,
     cells_to_play,
     engine_name,
     finished_cells,
     plan_cell,
+    plan_first_balls,
     variations,
     write_sweep,
 )
-from pace.evaluation.task import policy_on, task_line
+from pace.evaluation.task import own_pauses, policy_on, task_line
 from pace.rl.policies import TaskPolicy, built_in_policy, load_policy
 from pace.runs.progress import SECONDS_PER_LINE, clock
 from pace.runs.run_folder import make_out, versions
@@ -47,23 +47,39 @@ def evaluate_from_config(composed: DictConfig) -> None:
     config = parse(composed, EvaluateConfig)
     saved = choose_policy(config)
     policy = policy_on(config.task, saved)
-    overrides = [f"engine.physics_dt={config.physics_dt}", *config.overrides]
+    pauses = own_pauses(config.task, saved.config)
+    overrides = [f"engine.physics_dt={config.physics_dt}", *pauses, *config.overrides]
     context = circumstances(config, policy, overrides)
     task = override_task(policy.config, overrides)
     told = task_line(config.task, saved.config, task)
     print(f"policy {policy.source}\n{told}\n{describe(context)}", flush=True)
-    cells = [plan_cell(change, config, policy, overrides, context["versions"]) for change in changes(config, task)]
+    cells = plan(config, policy, task, overrides, context["versions"])
     folder = make_out(config.out, "evaluation")
     finished = finished_cells(folder, cells) if cells else {}
     if config.rows:
-        evaluate_table(config, policy, task, overrides, folder, context)
+        first = evaluate_table(config, policy, task, overrides, folder, context)
+        finished |= played_first_balls(config, cells, first)
     if cells:
         _announce(run_sweep(config, policy, cells, finished, folder, context))
 
 
-def changes(config: EvaluateConfig, task: TrainConfig) -> list[Variation]:
-    """The changes of the sweep, if there is one."""
-    return variations(task, config.variations, config.reality) if config.sweep else []
+def plan(
+    config: EvaluateConfig, policy: TaskPolicy, task: TrainConfig, overrides: Sequence[str], program: Any
+) -> list[Cell]:
+    """The cells of the sweep, if there is one: its changes, then the first balls."""
+    if not config.sweep:
+        return []
+    changes = variations(task, config.variations, config.reality)
+    cells = [plan_cell(change, config, policy, overrides, program) for change in changes]
+    return cells + plan_first_balls(config, policy, overrides, program)
+
+
+def played_first_balls(config: EvaluateConfig, cells: Sequence[Cell], first: Mapping[str, Any]) -> Tables:
+    """Those first balls of the sweep that the table has played (``first``, of :func:`first_balls`), by key of cell."""
+    if config.sweep_rows != [first["serve"]]:
+        return {}
+    rows = {row["wait"]: row for row in first["rows"]}
+    return {cell.key: [rows[cell.wait]] for cell in cells if cell.wait in rows}
 
 
 def evaluate_table(
@@ -73,8 +89,11 @@ def evaluate_table(
     overrides: Sequence[str],
     folder: Path,
     context: Mapping[str, Any],
-) -> None:
-    """Play the rows that ``config`` names, print their table and write it with its figures into ``folder``."""
+) -> dict[str, Any]:
+    """Play the rows that ``config`` names, print their table and write it with its figures into ``folder``.
+
+    Returns the first balls, which the table has too.
+    """
     worlds = config.worlds_for(config.serves)
     record = partial(QualityRecorder, config=config.quality)
     rows: list[Row] = []
@@ -86,16 +105,23 @@ def evaluate_table(
     files = write_report(folder, rows, config.paper, context, first)
     target = (task.landing_target[0], task.landing_target[1])
     _announce([*files, *write_figures(folder, rows, task.ball.table, target, config.warmup_serves)])
+    return first
 
 
 def first_balls(config: EvaluateConfig, policy: TaskPolicy, overrides: Sequence[str]) -> dict[str, Any]:
     """The first ball after standing ready for each time of ``config``; the row of each."""
-    serve, kind, worlds = config.first_ball_serve, config.first_ball_kind, config.first_ball_worlds
-    rows = []
-    for wait in config.first_ball:
-        with _bar(config, f"first ball after {wait:g} s", worlds) as show:
-            rows.append(first_ball_row(policy, wait, worlds, serve, kind, config.device, config.seed, overrides, show))
-    return {"serve": serve, "ball": kind, "rows": rows}
+    serve = config.first_ball_serve
+    rows = [_first_ball(config, policy, wait, serve, config.device, overrides) for wait in config.first_ball]
+    return {"serve": serve, "ball": config.first_ball_kind, "rows": rows}
+
+
+def _first_ball(
+    config: EvaluateConfig, policy: TaskPolicy, wait: float, serve: str, device: str, overrides: Sequence[str]
+) -> dict[str, Any]:
+    """The row of one time, with a progress bar of its robots."""
+    worlds, kind = config.first_ball_worlds, config.first_ball_kind
+    with _bar(config, f"first ball after {wait:g} s", worlds) as show:
+        return first_ball_row(policy, wait, worlds, serve, kind, device, config.seed, overrides, show)
 
 
 def choose_policy(config: EvaluateConfig) -> TaskPolicy:
@@ -168,7 +194,10 @@ def run_sweep(
 
 def play_cell(config: EvaluateConfig, policy: TaskPolicy, cell: Cell) -> list[dict[str, Any]]:
     """Summaries of the rows of a cell."""
-    label = cell.variation.label
+    label, wait = cell.variation.label, cell.wait
+    if wait is not None:
+        serves = config.sweep_rows
+        return [_first_ball(config, policy, wait, serve, cell.device, cell.overrides) for serve in serves]
     return [
         _with_bar(
             config, policy, name, f"{label}, {name}", cell.serves, cell.worlds, cell.device, cell.overrides

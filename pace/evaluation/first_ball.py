@@ -49,7 +49,8 @@ class FirstBallRecorder:
         falls = int(self.waiting_fall.sum())
         low, high = (1000.0 * bound for bound in wilson(falls, robots))
         found = {"wait": wait, "robots": robots, **rates(records[outcome != Outcome.BAD_SERVE])}
-        found |= {"falls_waiting_per_1000": 1000.0 * falls / robots}
+        every = int((outcome == Outcome.FALL).sum())
+        found |= {"falls_per_1000": 1000.0 * every / robots, "falls_waiting_per_1000": 1000.0 * falls / robots}
         return found | {"falls_waiting_per_1000_low": low, "falls_waiting_per_1000_high": high}
 
 
@@ -89,4 +90,4 @@ def first_ball_row(
     bad = env.first_bad()
     if bad is not None:
         raise EvaluationError(bad)
-    return recorder.summary(wait)
+    return {"serve": serve, **recorder.summary(wait)}

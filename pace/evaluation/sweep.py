@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -106,7 +106,8 @@ def _range(key: str, bounds: Sequence[float]) -> str:
 @dataclass(frozen=True)
 class Cell:
     """A variation as it is played: the overrides of the saved task, the device (the CPU for engine=native), serves a
-    row and worlds, and the time that it takes in serves of the fast engine.
+    row and worlds, and the time that it takes in serves of the fast engine. ``wait``: s that robots stand ready before
+    their first ball, which alone is played then; None for a row of serves.
 
     ``key`` identifies all settings that its numbers depend on: cells with the same key are played once, and found again
     in a sweep's file.
@@ -119,6 +120,7 @@ class Cell:
     worlds: int
     cost: float
     key: str
+    wait: float | None = None
 
 
 def engine_name(task: TrainConfig, device_type: str) -> str:
@@ -147,9 +149,30 @@ def plan_cell(
     worlds = config.worlds_for(serves)
     played = worlds * (config.warmup_serves + math.ceil(serves / worlds)) * len(config.sweep_rows)
     depends = [policy.source, dict(policy.counters), config.seed, config.warmup_serves, config.sweep_rows, serves]
-    text = json.dumps([*depends, worlds, str(device), program, to_dict(task)], sort_keys=True)
-    key = hashlib.sha256(text.encode()).hexdigest()[:16]
+    key = _key(*depends, worlds, str(device), program, to_dict(task))
     return Cell(variation, changed, str(device), serves, worlds, played * (SLOWNESS if slow else 1.0), key)
+
+
+def plan_first_balls(config: EvaluateConfig, policy: TaskPolicy, overrides: Sequence[str], program: Any) -> list[Cell]:
+    """A cell for each time of ``first_ball`` on the unchanged task, with the serves of ``sweep_rows``."""
+    given = plan_cell(Variation("first ball", "", ()), config, policy, overrides, program)
+    longest, worlds = override_task(policy.config, overrides).serve.max_duration, config.first_ball_worlds
+    return [
+        replace(
+            given,
+            variation=Variation("first ball", f"after {wait:g} s", ()),
+            serves=worlds,
+            worlds=worlds,
+            cost=worlds * len(config.sweep_rows) * (1.0 + wait / longest),
+            key=_key(given.key, wait, worlds, config.first_ball_kind),
+            wait=wait,
+        )
+        for wait in config.first_ball
+    ]
+
+
+def _key(*depends: Any) -> str:
+    return hashlib.sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def finished_cells(folder: Path, cells: Sequence[Cell]) -> Tables:

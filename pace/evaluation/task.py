@@ -1,4 +1,7 @@
-"""The task that an evaluation plays: one for every policy, or the policy's own."""
+"""The task that an evaluation plays: one for every policy, or the policy's own.
+
+A row sets the launch of its serves, spin included, for either. Pauses are the task's: none, or the policy's own.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,7 @@ import numpy as np
 
 from pace.config.base import compose, parse, to_dict
 from pace.config.sim import RobotConfig
+from pace.config.task import SPINS, ServeConfig
 from pace.config.training import TrainConfig
 from pace.rl.policies import TaskPolicy
 from pace.sim.robot import joint_gains, joint_group
@@ -18,6 +22,8 @@ from pace.sim.robot_spec import RobotSpec
 TABLE_PARTS = ("robot", "ball", "engine", "randomization", "sensing")
 #: Parts whose differences are told; a solver makes no other task.
 TOLD_PARTS = ("robot", "ball", "randomization", "sensing")
+#: Of the serves, what rows do not set.
+PAUSES = ("pause", "first_pause", "pause_ball")
 #: Differences in one part that are listed; more are counted.
 LISTED = 3
 
@@ -37,7 +43,7 @@ def table_task(config: TrainConfig) -> TrainConfig:
     parts = {name: getattr(usual, name) for name in TABLE_PARTS}
     parts["robot"] = _with_controller(usual.robot, config.robot)
     parts["engine"] = replace(usual.engine, name=config.engine.name, threads=config.engine.threads)
-    serve = replace(config.serve, pause=[0.0, 0.0], first_pause=[0.0, 0.0])
+    serve = replace(config.serve, **{name: getattr(usual.serve, name) for name in PAUSES})  # as in every row
     return replace(config, serve=serve, **parts)
 
 
@@ -57,9 +63,11 @@ def _with_controller(robot: RobotConfig, own: RobotConfig) -> RobotConfig:
 
 
 def differences(own: TrainConfig, played: TrainConfig) -> list[str]:
-    """How the task ``own`` differs from the one that is ``played``, by part: the name of its choice, or its values."""
+    """How the task ``own`` differs from the one that is ``played``, by part: the name of its choice, or its values; of
+    the serves their pauses, because rows set the rest."""
     told = [_difference(name, to_dict(getattr(own, name)), to_dict(getattr(played, name))) for name in TOLD_PARTS]
-    return [text for text in told if text]
+    pauses = [f"serve.{name}" for name in PAUSES if getattr(own.serve, name) != getattr(played.serve, name)]
+    return [text for text in told if text] + (pauses if own.serve.has_pauses or played.serve.has_pauses else [])
 
 
 def _difference(part: str, own: dict[str, Any], played: dict[str, Any]) -> str:
@@ -71,11 +79,27 @@ def _difference(part: str, own: dict[str, Any], played: dict[str, Any]) -> str:
     return ", ".join(f"{part}.{key}" for key in changed)
 
 
+def own_pauses(task: str, config: TrainConfig) -> list[str]:
+    """Overrides that give the rows of ``task=own`` the pauses of ``config``; empty without pauses, or for the table."""
+    serve = config.serve
+    if task != "own" or not serve.has_pauses:
+        return []
+    ranges = [f"serve.{name}=[{low},{high}]" for name, (low, high) in _pause_ranges(serve)]
+    return ranges + [f"serve.pause_ball.{does}={share}" for does, share in serve.pause_ball.items()]
+
+
+def _pause_ranges(serve: ServeConfig) -> list[tuple[str, list[float]]]:
+    return [("pause", serve.pause), ("first_pause", serve.first_pause)]
+
+
 def task_line(task: str, saved: TrainConfig, played: TrainConfig) -> str:
     """One line: the task that is played, and how the policy's own one differs."""
-    parts = ", ".join(f"{name}={getattr(played, name).name}" for name in TOLD_PARTS)
-    if task == "own":
-        return f"task=own: {parts}"
-    told = differences(saved, played)
-    own = f"task=own has {', '.join(told)}" if told else "task=own is the same"
-    return f"task=table: {parts}; {own}"
+    parts = [f"{name}={getattr(played, name).name}" for name in TOLD_PARTS]
+    if played.serve.has_pauses:
+        parts += [f"serve.{name}=[{low:g},{high:g}] s" for name, (low, high) in _pause_ranges(played.serve)]
+    line = f"task={task}: {', '.join(parts)}"
+    if task != "own":
+        told = differences(saved, played)
+        line += f"; task=own has {', '.join(told)}" if told else "; task=own is the same"
+    spun = [f"serve.{name}" for name in SPINS if any(getattr(saved.serve, name))]
+    return f"{line}; trained with {', '.join(spun)}, which the rows set" if spun else line

@@ -23,7 +23,7 @@ from pace.evaluation.__main__ import main
 from pace.evaluation.records import COLUMNS, C, count_failures, summarise, wilson
 from pace.evaluation.report import clean, write_json
 from pace.evaluation.serves import Row, ServeRecorder, evaluate_row
-from pace.evaluation.sweep import Variation, ball_presets, plan_cell, variations
+from pace.evaluation.sweep import Variation, ball_presets, plan_cell, plan_first_balls, variations
 from pace.evaluation.text import text_table
 from pace.predictor.regression import BIN_NAMES
 from pace.rl.policies import built_in_policy, load_policy
@@ -278,7 +278,11 @@ def check_files(out: Path, run: Path) -> None:
     assert content["quality"]["mixed"]["height"]["nominal"] == pytest.approx(0.664583)
     assert content["quality"]["mixed"]["thresholds"]["calm_speed"] == 1.0
     cells = json.loads((out / "sweep.json").read_text())["cells"]
-    assert [cell["kind"] for cell in cells] == ["as given", "ball", "engine"]
+    assert [cell["kind"] for cell in cells] == ["as given", "ball", "engine", "first ball", "first ball"]
+    assert [(row["wait"], row["serve"]) for cell in cells[3:] for row in cell["rows"]] == [
+        (0.0, "short"),
+        (0.1, "short"),
+    ]
     assert cells[0]["rows"] == cells[2]["rows"]  # auto is native on a CPU: the same cell
     for name in ("strike_map.png", "landing_map.png", "footwork.png", "by_ball.png", "sweep.png"):
         assert (out / name).read_bytes().startswith(b"\x89PNG")
@@ -347,6 +351,7 @@ SWEEP += [
     "device=cpu",
     "variations.ball=[venue]",
     "variations.engine=[]",
+    "first_ball=[]",
 ]
 SWEEP += [f"variations.{name}=[]" for name in ("noise", "latency", "friction", "trunk_mass")]
 
@@ -391,6 +396,38 @@ def test_an_interrupted_sweep_keeps_its_cells_and_goes_on(
     assert run_main(monkeypatch, *command) == 0  # nothing left to play
     assert "5 cells, 0 to play" in capsys.readouterr().out
     assert len(json.loads((tmp_path / "sweep.json").read_text())["cells"]) == 5
+
+
+def test_a_sweep_has_the_first_balls_and_takes_those_of_the_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    waits: list[float] = []
+
+    def stand(policy: object, wait: float, worlds: int, serve: str, *arguments: object) -> dict[str, object]:
+        waits.append(wait)
+        return {"wait": wait, **fake_row(worlds).summary, "serve": serve}
+
+    monkeypatch.setattr(evaluate, "evaluate_row", lambda *arguments: fake_row(2))
+    monkeypatch.setattr(evaluate, "first_ball_row", stand)
+    same = versions()
+    monkeypatch.setattr(evaluate, "versions", lambda: same)
+    more = ["variations.gain=[]", "first_ball=[0.0,3.0]", "first_ball_worlds=4"]
+    command = ["policy=zero", f"out={tmp_path}", *SWEEP, *more]
+    assert run_main(monkeypatch, *command) == 0
+    cells = json.loads((tmp_path / "sweep.json").read_text())["cells"]
+    labels = [f"{cell['kind']} {cell['value']}".strip() for cell in cells]
+    assert labels == ["as given", "ball venue", "first ball after 0 s", "first ball after 3 s"]
+    assert [(cell["num_worlds"], cell["rows"][0]["serves"]) for cell in cells[2:]] == [(4, 4), (4, 4)]
+    assert waits == [0.0, 3.0]
+    assert run_main(monkeypatch, *command) == 0
+    assert "4 cells, 0 to play" in capsys.readouterr().out
+    assert waits == [0.0, 3.0]
+    config = parse(compose("evaluate", ["policy=zero", "sweep_rows=[short]", "sweep=true", *more]), EvaluateConfig)
+    planned = plan_first_balls(config, built_in_policy("zero", 1), (), {})
+    rows = [{"wait": 3.0}, {"wait": 0.0}]
+    known = evaluate.played_first_balls(config, planned, {"serve": "short", "rows": rows})
+    assert [known[cell.key] for cell in planned] == [[{"wait": 0.0}], [{"wait": 3.0}]]
+    assert evaluate.played_first_balls(config, planned, {"serve": "mixed", "rows": rows}) == {}
 
 
 def test_a_file_that_is_no_sweep_is_left_alone(

@@ -14,7 +14,7 @@ from pace.config.realities import load_realities
 from pace.config.training import load_train_config
 from pace.evaluation import evaluate
 from pace.evaluation.sweep import variations
-from pace.evaluation.task import differences, policy_on, table_task, task_line
+from pace.evaluation.task import differences, own_pauses, policy_on, table_task, task_line
 from pace.rl.policies import TaskPolicy, built_in_policy, load_policy
 from pace.sim.robot import joint_gains
 
@@ -67,6 +67,64 @@ def test_one_line_says_how_the_tasks_differ() -> None:
     assert line.endswith("ball=paper, sensing.noise_scale")
     assert task_line("table", played, played).endswith("task=own is the same")
     assert task_line("own", own, own).startswith("task=own: robot=t1, ball=paper")
+
+
+PAUSED = [
+    "serve.pause=[0.5,3.0]",
+    "serve.first_pause=[0.0,1.5]",
+    "serve.pause_ball={lies: 0.5, carried: 0.0, hidden: 0.5}",
+]
+
+
+def test_the_line_tells_pauses_and_spin_of_the_policys_own_serves() -> None:
+    own = load_train_config([*PAUSED, "serve.sidespin=[-20,20]"])
+    played = table_task(own)
+    line = task_line("table", own, played)
+    assert "serve.pause" not in line.split(";")[0]  # the table has none
+    assert line.split("; ")[1:] == [
+        "task=own has serve.pause, serve.first_pause, serve.pause_ball",
+        "trained with serve.sidespin, which the rows set",
+    ]
+    assert task_line("own", own, own) == (
+        "task=own: robot=t1, ball=rubber, randomization=moderate, sensing=paper, serve.pause=[0.5,3] s, "
+        "serve.first_pause=[0,1.5] s; trained with serve.sidespin, which the rows set"
+    )
+
+
+@pytest.mark.parametrize("row", ["long", "machine"])
+def test_a_row_of_the_own_task_has_the_policys_pauses_and_the_rows_launches(row: str) -> None:
+    own = load_train_config([*PAUSED, "serve.sidespin=[-20,20]"])
+    usual, overrides = load_train_config([f"serve={row}"]).serve, own_pauses("own", own)
+    played = override_task(own, [f"serve={row}", *overrides]).serve
+    assert (played.pause, played.first_pause, played.pause_ball) == (
+        [0.5, 3.0],
+        [0.0, 1.5],
+        {"lies": 0.5, "carried": 0.0, "hidden": 0.5},
+    )
+    kept = {"pause": usual.pause, "first_pause": usual.first_pause, "pause_ball": usual.pause_ball}
+    assert replace(played, **kept) == usual
+    assert own_pauses("table", own) == own_pauses("own", load_train_config()) == []
+    later = override_task(own, [f"serve={row}", *overrides, "serve.pause=[5.0,5.0]"]).serve
+    assert later.pause == [5.0, 5.0]  # the command line wins
+
+
+def test_the_own_pauses_reach_the_rows(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    own = replace(built_in_policy("zero", 1), config=load_train_config(PAUSED))
+    monkeypatch.setattr(evaluate, "choose_policy", lambda config: own)
+    seen: list[list[float]] = []
+
+    def play(policy: TaskPolicy, serve: str, *arguments: object) -> None:
+        overrides = arguments[4]
+        assert isinstance(overrides, list | tuple)
+        seen.append(override_task(policy.config, [f"serve={serve}", *overrides]).serve.pause)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(evaluate, "evaluate_row", play)
+    for task in ("own", "table"):
+        with pytest.raises(KeyboardInterrupt):
+            evaluate.evaluate_from_config(compose("evaluate", ["policy=zero", f"task={task}", "rows=[long]"]))
+    assert seen == [[0.5, 3.0], [0.0, 0.0]]
+    assert "task=own has serve.pause" in capsys.readouterr().out
 
 
 def test_serve_values_change_every_row(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,6 +13,7 @@ from pace.rl.trainer import Trainer
 from pace.runs.checkpoint import load_checkpoint
 from pace.runs.metrics_file import read_rows
 from pace.runs.run_folder import RunFolder
+from tests.helpers.algo import IN_SAMPLES
 from tests.helpers.dummy import DummyTask
 
 WORLDS, STEPS = 16, 4
@@ -27,6 +28,7 @@ def dummy_config(updates: int, **changes: object) -> TrainConfig:
             f"num_worlds={WORLDS}", f"samples={updates * UPDATE}", "minutes=0", f"algo.steps={STEPS}",
             "algo.actor_hidden=[16]", "algo.critic_hidden=[16]", "algo.autocast=fp32",
             "predictor.batches_per_update=1", "tensorboard=false", "progress=false", "checkpoint_minutes=0",
+            *IN_SAMPLES,
         ]
     )  # fmt: skip
     for name, value in changes.items():
