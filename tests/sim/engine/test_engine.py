@@ -23,7 +23,7 @@ EVERY = torch.ones(WORLDS, dtype=torch.bool)
 ENGINES = ("native", "mjwarp")
 #: kg: the maker's sum for the T1 with its paddle; that of the 29-joint T1, and a paddle of 0.17
 MASS = {"t1": 31.9052, "t1_29dof": 34.6325 + 0.17}
-#: Engine and robot; another robot on mjwarp takes minutes, so one test compares it with native.
+#: Engine and robot; make test compares t1_29dof on mjwarp with native once, make test-long asks it everything.
 PAIRS = [
     ("native", "t1"),
     ("mjwarp", "t1"),

@@ -19,7 +19,7 @@ CONFIG = CONFIGS["t1"]
 WORLDS = 8
 EVERY = torch.ones(WORLDS, dtype=torch.bool)
 Factor = float | np.ndarray  # of all worlds, or (N, 1)
-#: Engine and robot; another robot on mjwarp takes long to build.
+#: Engine and robot; only make test-long builds another robot on mjwarp.
 PAIRS = [
     ("native", "t1"),
     ("mjwarp", "t1"),
