@@ -17,8 +17,9 @@ from pace.config.renamed import change_stages, with_current_names
 from pace.config.task import SPINS
 
 #: Format that this version writes. 1: version 0.1.0 up to commit 43400ac; 2: up to 72b96bb, before the true world;
-#: 3: up to 8d3869a, before gears had play and motors the maker's numbers.
-FORMAT = 4
+#: 3: up to 8d3869a, before gears had play and motors the maker's numbers; 4: up to cd18fd6, before the free hand on the
+#: table had its own outcome.
+FORMAT = 5
 
 #: Landing target of a saved configuration without one (released configuration).
 LANDING_TARGET = (1.15, 0.0)  # m
@@ -195,6 +196,14 @@ def add_the_body(state: Saved) -> None:
         env["statistics.sums"][:-2] = sums
 
 
+def count_the_free_hand(state: Saved) -> None:
+    """The free hand on the table was counted with the pushes; its own count is the last of the statistics."""
+    for env in _environments(state):
+        sums = env["statistics.sums"]
+        env["statistics.sums"] = sums.new_zeros(len(sums) + 1)
+        env["statistics.sums"][:-1] = sums
+
+
 def _environments(state: Saved) -> Iterator[Saved]:
     """The saved tensors of each process's environment; none in a state without processes."""
     for process in state.get("processes") or ():
@@ -230,6 +239,7 @@ STATE_UPGRADES: list[Upgrade] = [
     (4, sample_play_and_mount),
     (4, add_what_motors_and_joints_sample),
     (4, add_the_body),
+    (5, count_the_free_hand),
 ]
 
 

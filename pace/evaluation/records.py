@@ -23,7 +23,7 @@ COLUMNS = (
 )  # fmt: skip
 C = {name: index for index, name in enumerate(COLUMNS)}
 #: Failures of a serve; ``rim`` takes precedence over the outcome after it.
-FAILURES = ("miss", "net", "out", "own_side", "rim", "double_hit", "volley", "body", "table_touch", "fall")
+FAILURES = ("miss", "net", "out", "own_side", "rim", "double_hit", "volley", "body", "free_hand", "table_touch", "fall")
 #: Outcomes that count as ``rim`` after a hit with the rim.
 RIM_FAULTS = (Outcome.NET, Outcome.OUT, Outcome.OWN_SIDE)
 Z95 = 1.959963984540054  # 97.5 % quantile of the normal distribution

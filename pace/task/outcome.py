@@ -17,4 +17,5 @@ class Outcome(IntEnum):
     FALL = 8  # the robot fell or left its area before the serve was decided
     BAD_SERVE = 9  # the serve never bounces on the robot's half: not the robot's fault
     BODY = 10  # the ball touched the robot's body, arms, legs or head, before or after the hit
-    TABLE_TOUCH = 11  # the free hand touched the playing surface, or the robot pushed the table
+    TABLE_TOUCH = 11  # a part of the robot pushed the table so that it would move
+    FREE_HAND = 12  # the free hand touched the playing surface

@@ -5,7 +5,7 @@ import warp as wp
 from pace.sim.ball.state import BallArrays, EventArrays
 from pace.task.game_state import GameArrays
 from pace.task.outcome import Outcome
-from pace.task.rules import Rules, landed, table_touch_time
+from pace.task.rules import Fault, Rules, first_fault, landed, table_fault
 
 
 @wp.func
@@ -13,24 +13,6 @@ def _after(time: float, since: float) -> float:
     if time > since:
         return time
     return wp.inf
-
-
-@wp.struct
-class Fault:
-    """The robot's first fault of a control step that no ball makes legal: a touch by its body, or of the table."""
-
-    time: wp.float32  # s into the step; infinite if there is none
-    outcome: wp.int32
-
-
-@wp.func
-def _fault(body: float, table: float) -> Fault:
-    fault = Fault()
-    fault.time = wp.min(body, table)
-    fault.outcome = Outcome.BODY
-    if table < body:
-        fault.outcome = Outcome.TABLE_TOUCH
-    return fault
 
 
 @wp.func
@@ -106,7 +88,7 @@ def judge(game: GameArrays, events: EventArrays, ball: BallArrays, table_force: 
     dead = wp.min(events.floor_time[world], events.edge_time[world])
     missed = _missed_time(events, before, touch, dead, world)
     lost = missed < wp.inf
-    fault = _fault(events.body_time[world], table_touch_time(table_force, rules, world))
+    fault = first_fault(events.body_time[world], table_fault(table_force, rules, world))
     at_fault = fault.time < wp.min(touch, missed)
     hit_now = was_open and not hit_before and struck and not lost and not at_fault and before == 1
     outcome = game.referee.outcome[world]

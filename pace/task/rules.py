@@ -43,15 +43,36 @@ def something_to_hit_now(game: GameArrays, ball: BallArrays, rules: Rules, world
     return undecided and not nothing_to_hit(ball.position[world], ball.velocity[world], rules)
 
 
+@wp.struct
+class Fault:
+    """A fault of the robot that no ball makes legal: a touch of the ball by its body, or of the table."""
+
+    time: wp.float32  # s into the control step; infinite if there is none
+    outcome: wp.int32
+
+
 @wp.func
-def table_touch_time(table_force: wp.array3d[wp.vec3], rules: Rules, world: int) -> float:
-    """When (s into the control step) the free hand first touches the playing surface or the robot has pushed the table;
-    infinite if it does neither.
+def first_fault(body: float, table: Fault) -> Fault:
+    """The earlier of a touch by the body at the time ``body`` and ``table``; the body's of two at the same time."""
+    if table.time < body:
+        return table
+    fault = Fault()
+    fault.time = body
+    fault.outcome = Outcome.BODY
+    return fault
+
+
+@wp.func
+def table_fault(table_force: wp.array3d[wp.vec3], rules: Rules, world: int) -> Fault:
+    """The free hand's first touch of the playing surface, or the push of the table before it; the hand's of two in the
+    same physics step.
 
     On the top a contact's force is steeper than 45 degrees, as friction is below 1; on the sides it is flatter. A push
     is a mean force over the control step, so that it does not depend on the physics step: the table moves once the
     impulse is that of ``rules.table_push``.
     """
+    fault = Fault()
+    fault.time = wp.inf
     steps = table_force.shape[1]
     dt = rules.control_dt / float(steps)
     impulse = wp.vec3()
@@ -59,11 +80,15 @@ def table_touch_time(table_force: wp.array3d[wp.vec3], rules: Rules, world: int)
         if table_force.shape[2] > 1:
             hand = table_force[world, step, 1]
             if hand[2] > wp.length(wp.vec2(hand[0], hand[1])):
-                return float(step) * dt
+                fault.time = float(step) * dt
+                fault.outcome = Outcome.FREE_HAND
+                return fault
         impulse += dt * table_force[world, step, 0]
         if wp.length(impulse) > rules.table_push * rules.control_dt:
-            return float(step + 1) * dt
-    return wp.inf
+            fault.time = float(step + 1) * dt
+            fault.outcome = Outcome.TABLE_TOUCH
+            return fault
+    return fault
 
 
 @wp.func

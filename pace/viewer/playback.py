@@ -42,7 +42,8 @@ OUTCOME_NAMES = {
     Outcome.DOUBLE_HIT: "hit twice",
     Outcome.VOLLEY: "hit before the bounce",
     Outcome.BODY: "touched by the body",
-    Outcome.TABLE_TOUCH: "touched the table",
+    Outcome.TABLE_TOUCH: "pushed the table",
+    Outcome.FREE_HAND: "free hand on the table",
     Outcome.FALL: "fell",
     Outcome.BAD_SERVE: "a serve beside the table",
 }

@@ -14,7 +14,7 @@ from pace.config import automatic, ball, commands, predictor, quality, schedules
 from pace.config.base import ConfigError, parse
 from pace.config.limits import LIMITS, first_outside, limits_of
 from pace.config.training import TrainConfig, load_train_config
-from pace.config.upgrade import FORMAT, upgrade_config
+from pace.config.upgrade import upgrade_config
 from tests.helpers.recipes import defaults
 
 
@@ -99,7 +99,7 @@ def test_a_seed_is_counted_from_zero_and_an_old_one_is_kept(seed: int) -> None:
     with pytest.raises(ConfigError, match=f"seed must lie within 0 and 4294967295, got {seed}"):
         load_train_config([f"seed={seed}"])
     old = defaults() | {"seed": seed}
-    assert parse(upgrade_config(old, FORMAT - 1), TrainConfig).seed == seed % 2**32
+    assert parse(upgrade_config(old, 3), TrainConfig).seed == seed % 2**32
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ from pace.config.upgrade import FORMAT, upgrade_config, upgrade_state
 from pace.rl.policies import load_policy
 from pace.runs.checkpoint import META, load_checkpoint, read_meta
 from pace.runs.queue import Run, check_settings
+from pace.task.statistics import NAMES
 from tests.helpers.saved import save_run
 
 
@@ -150,7 +151,14 @@ def test_a_state_of_format_2_gets_what_the_true_world_keeps() -> None:
     assert env["worlds.drawn.paddle_error"].tolist() == [[0.0] * 5] * 3
     assert env["worlds.event.body"].tolist() == [0] * 3
     assert env["worlds.event.body_time"].isinf().all()
-    assert env["statistics.sums"].tolist() == [*range(16), 0, 0]
+    assert env["statistics.sums"].tolist() == [*range(16), 0, 0, 0]
+
+
+def test_a_state_of_format_4_gets_the_count_of_the_free_hand() -> None:
+    saved = {"statistics.sums": torch.arange(18.0)}
+    env = upgrade_state({"processes": [{"env": saved}]}, 4)["processes"][0]["env"]
+    counts = dict(zip(NAMES, env["statistics.sums"].tolist(), strict=True))
+    assert (counts["outcome/table_touch"], counts["outcome/free_hand"]) == (17.0, 0.0)
 
 
 @pytest.mark.parametrize("robot", ["t1_paper", "t1_29dof"])

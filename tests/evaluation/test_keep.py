@@ -51,6 +51,16 @@ def test_the_kept_policy_acts_like_the_run(
     assert (after.config.engine.name, after.config.engine.threads, after.config.out) == ("auto", 0, None)
 
 
+def test_an_evaluation_from_before_the_free_hand_was_counted_makes_a_card(tmp_path: Path) -> None:
+    saved = Path("docs/results/baseline/campaign.json").read_text()
+    old = json.loads(saved)["rows"][0]
+    assert "free_hand" not in old["failures"]
+    (tmp_path / "evaluation.json").write_text(saved)
+    keep(save_run(tmp_path / "run"), tmp_path / "mine", tmp_path)
+    cells = f"| {old['serve']} | {old['serves']:,} | {100 * old['hit']:.1f} "
+    assert cells in (tmp_path / "mine" / "README.md").read_text()
+
+
 def test_the_card_says_what_it_is_and_how_to_play_its_table(tmp_path: Path) -> None:
     run = save_run(tmp_path / "run")
     (tmp_path / "run" / "versions.json").write_text(

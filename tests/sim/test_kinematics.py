@@ -15,9 +15,9 @@ WORLDS, SUBSTEPS = 6, 3
 TOLERANCE = 1e-5
 
 
-@pytest.fixture(scope="module")
-def model():
-    config = load_train_config()
+@pytest.fixture(scope="module", params=["t1", "t1_29dof"])  # t1_paper has the kinematics of t1
+def model(request):
+    config = load_train_config([f"robot={request.param}"])
     return build_model(config.robot, config.engine, config.ball.table)
 
 
@@ -126,6 +126,8 @@ def test_masked_worlds_are_updated_alone(model, path):
 def test_wrong_shapes_and_order_are_clear_errors(model):
     kinematics = Kinematics(model, SPEC.tips, WORLDS, SUBSTEPS, "cpu")
     with pytest.raises(RuntimeError, match="call update"):
-        kinematics.paddle_generalized_force(torch.zeros(WORLDS, 3), torch.zeros(WORLDS, 3), torch.zeros(WORLDS, 27))
-    with pytest.raises(ValueError, match=r"qpos_path must have shape \(6, 4, 28\)"):
-        kinematics.update(torch.zeros(WORLDS, 2, 28), torch.zeros(WORLDS, 2, 27))
+        kinematics.paddle_generalized_force(
+            torch.zeros(WORLDS, 3), torch.zeros(WORLDS, 3), torch.zeros(WORLDS, model.nv)
+        )
+    with pytest.raises(ValueError, match=rf"qpos_path must have shape \(6, 4, {model.nq}\)"):
+        kinematics.update(torch.zeros(WORLDS, 2, model.nq), torch.zeros(WORLDS, 2, model.nv))

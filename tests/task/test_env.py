@@ -279,7 +279,13 @@ def test_the_flight_after_a_hit_ends_where_its_forecast_said() -> None:
     on_table = hits & (env.game.returns.landing[:, 2] > 0.7) & (outcome >= 0)
     torch.testing.assert_close(touchdown[on_table], landing[on_table], atol=2e-3, rtol=0)
     decided = hits & (outcome >= 0)
-    for other in (Outcome.FALL, Outcome.DOUBLE_HIT, Outcome.BODY, Outcome.TABLE_TOUCH):  # not in the forecast
+    for other in (
+        Outcome.FALL,
+        Outcome.DOUBLE_HIT,
+        Outcome.BODY,
+        Outcome.TABLE_TOUCH,
+        Outcome.FREE_HAND,
+    ):  # not in the forecast
         decided &= outcome != other
     assert torch.equal((outcome == Outcome.SUCCESS)[decided], lands_opponent[decided])
 

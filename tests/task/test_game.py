@@ -201,12 +201,13 @@ def test_a_touch_by_the_body_loses_the_point(steps: list[dict[str, Any]], outcom
 
 #: N, force on the robot in both physics steps; the table pushes back at 100 N mean over the step.
 TOP, SIDE, NONE = (0.0, 0.0, 5.0), (-60.0, 0.0, 20.0), (0.0, 0.0, 0.0)
+PUSH, LEAN = (-150.0, 0.0, 20.0), (0.0, 0.0, 150.0)
 
 
 @pytest.mark.parametrize(
     ("robot", "hand", "step", "outcome"),
     [
-        pytest.param((TOP, NONE), (TOP, NONE), {}, Outcome.TABLE_TOUCH, id="free hand on the top"),
+        pytest.param((TOP, NONE), (TOP, NONE), {}, Outcome.FREE_HAND, id="free hand on the top"),
         pytest.param((TOP, TOP), (NONE, NONE), {}, Outcome.OPEN, id="the paddle on the top"),
         pytest.param((SIDE, SIDE), (SIDE, SIDE), {}, Outcome.OPEN, id="free hand at the table's side"),
         pytest.param(((0, 0, -9.0), NONE), ((0, 0, -9.0), NONE), {}, Outcome.OPEN, id="free hand under the top"),
@@ -217,7 +218,11 @@ TOP, SIDE, NONE = (0.0, 0.0, 5.0), (-60.0, 0.0, 20.0), (0.0, 0.0, 0.0)
         pytest.param(((0, 0, 190.0), NONE), (NONE, NONE), {}, Outcome.OPEN, id="a knock of the paddle"),
         pytest.param(((0, 0, 210.0), NONE), (NONE, NONE), {}, Outcome.TABLE_TOUCH, id="a hard blow of the paddle"),
         pytest.param(((-150.0, 0, 0), (150.0, 0, 0)), (NONE, NONE), {}, Outcome.OPEN, id="there and back"),
-        pytest.param((NONE, TOP), (NONE, TOP), {"body": 0.011}, Outcome.TABLE_TOUCH, id="hand before body"),
+        pytest.param((PUSH, PUSH), (PUSH, PUSH), {}, Outcome.TABLE_TOUCH, id="free hand pushes the side"),
+        pytest.param((LEAN, LEAN), (LEAN, LEAN), {}, Outcome.FREE_HAND, id="free hand leans on the top"),
+        pytest.param((LEAN, LEAN), (NONE, TOP), {}, Outcome.FREE_HAND, id="hand before the push is over"),
+        pytest.param(((0, 0, 210.0), TOP), (NONE, TOP), {}, Outcome.TABLE_TOUCH, id="push before hand"),
+        pytest.param((NONE, TOP), (NONE, TOP), {"body": 0.011}, Outcome.FREE_HAND, id="hand before body"),
         pytest.param((NONE, TOP), (NONE, TOP), {"body": 0.009}, Outcome.BODY, id="body before hand"),
     ],
 )
@@ -236,7 +241,7 @@ def test_the_table_must_not_be_touched_nor_pushed(
 def test_a_touch_of_the_table_counts_by_its_time_among_the_others() -> None:
     for times, outcome in (
         ({"opponent_bounce": 0.009}, Outcome.SUCCESS),
-        ({"opponent_bounce": 0.011}, Outcome.TABLE_TOUCH),
+        ({"opponent_bounce": 0.011}, Outcome.FREE_HAND),
     ):
         serve = Serve().step(**BOUNCE).step(**HIT)
         serve.table_force[0, 1] = torch.tensor(TOP)  # from 0.010 s on

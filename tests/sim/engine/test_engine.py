@@ -13,22 +13,30 @@ from pace.devices import resolve_device
 from pace.sim.engine.base import EngineParams
 from pace.sim.engine.factory import make_engine
 from pace.sim.engine.native import NativeEngine
-from pace.sim.robot import build_model, nominal_pose
-from tests.helpers.robot import CONTACT_BODIES, JOINT_NAMES
+from pace.sim.robot import build_model
+from pace.sim.robot_spec import RobotSpec
 
 WORLDS = 4
-CONFIG = load_train_config()
-NOMINAL = torch.as_tensor(nominal_pose(CONFIG.robot), dtype=torch.float32)
-STILL = torch.zeros(WORLDS, 27)
+CONFIGS = {name: load_train_config([f"robot={name}"]) for name in ("t1", "t1_29dof")}
+CONFIG = CONFIGS["t1"]
 EVERY = torch.ones(WORLDS, dtype=torch.bool)
 ENGINES = ("native", "mjwarp")
-MASS = 31.9052
+#: kg: the maker's sum for the T1 with its paddle; that of the 29-joint T1, and a paddle of 0.17
+MASS = {"t1": 31.9052, "t1_29dof": 34.6325 + 0.17}
+#: Engine and robot; make test compares t1_29dof on mjwarp with native once, make test-long asks it everything.
+PAIRS = [
+    ("native", "t1"),
+    ("mjwarp", "t1"),
+    ("native", "t1_29dof"),
+    pytest.param(("mjwarp", "t1_29dof"), marks=pytest.mark.long),
+]
 
 
-def build(name, physics_dt=0.01, control_dt=0.02, **engine_options):
+def build(name, physics_dt=0.01, control_dt=0.02, robot="t1", **engine_options):
     """An engine of WORLDS worlds, and its model."""
-    engine = dataclasses.replace(CONFIG.engine, name=name, physics_dt=physics_dt, **engine_options)
-    model = build_model(CONFIG.robot, engine, CONFIG.ball.table)
+    config = CONFIGS[robot]
+    engine = dataclasses.replace(config.engine, name=name, physics_dt=physics_dt, **engine_options)
+    model = build_model(config.robot, engine, config.ball.table)
     return make_engine(model, engine, WORLDS, "cpu", round(control_dt / physics_dt)), model
 
 
@@ -38,19 +46,45 @@ def standing(model, lift=0.0):
     return qpos
 
 
-def random_targets(engine, generator, scale=0.25):
-    targets = NOMINAL + scale * torch.randn(WORLDS, 1, len(JOINT_NAMES), generator=generator)
+def still(model):
+    return torch.zeros(WORLDS, model.nv)
+
+
+def random_targets(engine, model, generator, scale=0.25):
+    targets = standing(model)[:, None, 7:] + scale * torch.randn(WORLDS, 1, model.nu, generator=generator)
     return targets.repeat(1, engine.substeps, 1)
 
 
-def hold(engine):
-    return NOMINAL.repeat(WORLDS, engine.substeps, 1)
+def hold(engine, model):
+    return standing(model)[:, None, 7:].repeat(1, engine.substeps, 1)
 
 
-@pytest.fixture(scope="module", params=ENGINES)
-def shared(request):
+def joints(model):
+    return [model.actuator(index).name for index in range(model.nu)]
+
+
+def contact_bodies(model):
+    """Names of the columns of ``body_contact``."""
+    return next(
+        spec.contacts for config in CONFIGS.values() if len((spec := RobotSpec.of(config.robot)).joints) == model.nu
+    )
+
+
+@pytest.fixture(scope="module", params=PAIRS, ids="-".join)
+def pair(request):
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def robot(pair):
+    return pair[1]
+
+
+@pytest.fixture(scope="module")
+def shared(pair):
     """One engine of each kind at 10 ms for the tests that put back what they change."""
-    return build(request.param)
+    name, robot = pair
+    return build(name, robot=robot)
 
 
 @pytest.fixture
@@ -61,26 +95,29 @@ def fresh(shared):
     for field in dataclasses.fields(EngineParams):
         getattr(engine.params, field.name).copy_(getattr(nominal, field.name))
     engine.apply_params(EVERY)
-    engine.reset(EVERY, standing(model), STILL)
+    engine.reset(EVERY, standing(model), still(model))
     return engine, model
 
 
-@pytest.mark.parametrize("physics_dt", [0.002, 0.01])
-def test_engines_agree_over_the_same_random_targets(physics_dt):
+@pytest.mark.parametrize(
+    ("physics_dt", "robot"),
+    [(0.002, "t1"), (0.01, "t1"), pytest.param(0.01, "t1_29dof", marks=pytest.mark.slow)],
+)
+def test_engines_agree_over_the_same_random_targets(physics_dt, robot):
     """Float32 against float64, and solver tolerances of 1e-6 and 1e-8, differ by 1e-4 rad/s over 0.2 s.
 
     Later a contact that one engine makes a step earlier sets them apart: motion on a rigid floor is chaotic.
     """
-    (native, model), (warp, _) = (build(name, physics_dt) for name in ENGINES)
+    (native, model), (warp, _) = (build(name, physics_dt, robot=robot) for name in ENGINES)
     generator = torch.Generator().manual_seed(5)
     for engine in (native, warp):
         engine.params.friction.copy_(torch.tensor([0.5, 0.7, 0.9, 1.0]))
         engine.params.trunk_mass.copy_(torch.tensor([-2.0, 0.0, 1.0, 2.0]))
         engine.params.kp_scale.copy_(torch.tensor([0.9, 1.0, 1.1, 1.2]))
         engine.apply_params(EVERY)
-        engine.reset(EVERY, standing(model), STILL)
+        engine.reset(EVERY, standing(model), still(model))
     for _ in range(10):
-        targets, applied = random_targets(native, generator), torch.randn(WORLDS, 27, generator=generator)
+        targets, applied = random_targets(native, model, generator), torch.randn(WORLDS, model.nv, generator=generator)
         for engine in (native, warp):
             engine.advance(targets, applied)
         torch.testing.assert_close(warp.qpos_path, native.qpos_path, atol=1e-4, rtol=0)
@@ -91,14 +128,15 @@ def test_engines_agree_over_the_same_random_targets(physics_dt):
     assert native.foot_force[..., 2].max() > 100.0  # the robots did stand and step
 
 
-def test_native_is_mj_step_bit_by_bit():
-    engine, model = build("native", physics_dt=0.004)
+@pytest.mark.parametrize("robot", CONFIGS)
+def test_native_is_mj_step_bit_by_bit(robot):
+    engine, model = build("native", physics_dt=0.004, robot=robot)
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
     generator = torch.Generator().manual_seed(2)
     engine.load_state_dict(engine.state_dict() | {"qpos": torch.as_tensor(model.key_qpos).repeat(WORLDS, 1)})
     for _ in range(5):
-        targets, applied = random_targets(engine, generator), torch.randn(WORLDS, 27, generator=generator)
+        targets, applied = random_targets(engine, model, generator), torch.randn(WORLDS, model.nv, generator=generator)
         engine.advance(targets, applied)
         data.qfrc_applied[:] = applied[1].numpy()
         for step in range(engine.substeps):
@@ -118,13 +156,13 @@ def test_native_stops_mujocos_timers():
 
 
 def test_path_begins_where_the_last_one_ended_plus_the_push(fresh):
-    engine, _ = fresh
-    engine.advance(hold(engine), STILL)
+    engine, model = fresh
+    engine.advance(hold(engine, model), still(model))
     end_qpos, end_qvel = engine.qpos_path[:, -1].clone(), engine.qvel_path[:, -1].clone()
-    push = torch.zeros(WORLDS, 27)
+    push = still(model)
     push[1, 0], push[2, 1] = 0.3, -0.2
     engine.add_velocity(push)
-    engine.advance(hold(engine), STILL)
+    engine.advance(hold(engine, model), still(model))
     torch.testing.assert_close(engine.qpos_path[:, 0], end_qpos)
     torch.testing.assert_close(engine.qvel_path[:, 0], end_qvel + push)
 
@@ -134,20 +172,29 @@ def test_tensors_are_the_same_objects_for_ever(fresh):
     names = ("qpos_path", "qvel_path", "foot_force", "body_contact", "joint_torque")
     before = [getattr(engine, name).data_ptr() for name in names]
     shapes = [tuple(getattr(engine, name).shape) for name in names]
-    engine.advance(hold(engine), STILL)
-    engine.reset(EVERY, standing(model), STILL)
+    engine.advance(hold(engine, model), still(model))
+    engine.reset(EVERY, standing(model), still(model))
     assert [getattr(engine, name).data_ptr() for name in names] == before
-    assert shapes == [(WORLDS, 3, 28), (WORLDS, 3, 27), (WORLDS, 2, 3), (WORLDS, len(CONTACT_BODIES)), (WORLDS, 21)]
+    sizes = (model.nq, model.nv, len(contact_bodies(model)), model.nu)
+    assert sizes in [(28, 27, 11, 21), (34, 33, 13, 27)]
+    positions, velocities, contacts, torques = sizes
+    assert shapes == [
+        (WORLDS, 3, positions),
+        (WORLDS, 3, velocities),
+        (WORLDS, 2, 3),
+        (WORLDS, contacts),
+        (WORLDS, torques),
+    ]
 
 
 def test_reset_touches_the_masked_worlds_alone(fresh):
     engine, model = fresh
     generator = torch.Generator().manual_seed(8)
     for _ in range(3):
-        engine.advance(random_targets(engine, generator), STILL)
+        engine.advance(random_targets(engine, model, generator), still(model))
     before = {name: value.clone() for name, value in engine.state_dict().items()}
     mask = torch.tensor([False, True, False, True])
-    qpos, qvel = standing(model, lift=0.5), 0.1 * torch.ones(WORLDS, 27)
+    qpos, qvel = standing(model, lift=0.5), torch.full((WORLDS, model.nv), 0.1)
     engine.reset(mask, qpos, qvel)
     for name, value in engine.state_dict().items():
         torch.testing.assert_close(value[~mask], before[name][~mask], rtol=0, atol=0)
@@ -159,30 +206,30 @@ def test_reset_touches_the_masked_worlds_alone(fresh):
 
 def test_a_reset_world_forgets_its_past_even_a_nan(fresh):
     engine, model = fresh
-    engine.advance(hold(engine), STILL)
+    engine.advance(hold(engine, model), still(model))
     expected = engine.qvel_path[0].clone()
-    broken = torch.zeros(WORLDS, 27)
+    broken = still(model)
     broken[2] = torch.nan
     engine.add_velocity(broken)
-    engine.advance(hold(engine), STILL)
+    engine.advance(hold(engine, model), still(model))
     assert not engine.qvel_path[2, -1].isfinite().all()  # seen, not healed in silence
     assert engine.qvel_path[[0, 1, 3]].isfinite().all()
-    engine.reset(EVERY, standing(model), STILL)
-    engine.advance(hold(engine), STILL)
+    engine.reset(EVERY, standing(model), still(model))
+    engine.advance(hold(engine, model), still(model))
     torch.testing.assert_close(engine.qvel_path[2], expected, rtol=0, atol=1e-5)
 
 
 def test_state_dict_continues_exactly(fresh):
-    engine, _ = fresh
+    engine, model = fresh
     generator = torch.Generator().manual_seed(4)
-    targets = [random_targets(engine, generator) for _ in range(6)]
+    targets = [random_targets(engine, model, generator) for _ in range(6)]
     for target in targets[:3]:
-        engine.advance(target, STILL)
+        engine.advance(target, still(model))
     saved = {name: value.clone() for name, value in engine.state_dict().items()}
     ends = []
     for _ in range(2):
         for target in targets[3:]:
-            engine.advance(target, STILL)
+            engine.advance(target, still(model))
         ends.append(engine.qpos_path.clone())
         engine.load_state_dict(saved)
     torch.testing.assert_close(ends[0], ends[1], rtol=0, atol=0)
@@ -194,8 +241,9 @@ def _friction(model):
 
 
 def _trunk_mass(model):
-    model.body("Trunk").inertia[:] *= (11.7 + 3.0) / 11.7
-    model.body("Trunk").mass[0] += 3.0
+    trunk = model.body("Trunk")
+    trunk.inertia[:] *= (trunk.mass[0] + 3.0) / trunk.mass[0]
+    trunk.mass[0] += 3.0
 
 
 def _trunk_com(model):
@@ -225,7 +273,7 @@ def _speed(model):
 
 
 def _ankles(model):
-    ankles = [index for index, name in enumerate(JOINT_NAMES) if "Ankle" in name]
+    ankles = [index for index, name in enumerate(joints(model)) if "Ankle" in name]
     model.actuator_forcerange[ankles] *= 0.1
     model.actuator_gainprm[ankles, 0] /= 0.1
 
@@ -255,10 +303,12 @@ CHANGES = {
 
 def play(engine, model):
     """Four control steps of the same targets and a sidewards shove in every world."""
-    engine.reset(EVERY, standing(model), STILL)
+    engine.reset(EVERY, standing(model), still(model))
     generator = torch.Generator().manual_seed(6)
-    targets = (NOMINAL + 0.3 * torch.randn(4, 1, 1, 21, generator=generator)).expand(-1, WORLDS, engine.substeps, -1)
-    shove = torch.zeros(WORLDS, 27)
+    nominal = standing(model)[0, 7:]
+    targets = nominal + 0.3 * torch.randn(4, 1, 1, model.nu, generator=generator)
+    targets = targets.expand(-1, WORLDS, engine.substeps, -1)
+    shove = still(model)
     shove[:, 1] = 150.0
     for target in targets:
         engine.advance(target, shove)
@@ -266,7 +316,7 @@ def play(engine, model):
 
 
 @pytest.mark.parametrize("name", CHANGES)
-def test_a_parameter_changes_its_world_alone_and_as_in_mujoco(fresh, name):
+def test_a_parameter_changes_its_world_alone_and_as_in_mujoco(fresh, robot, name):
     engine, model = fresh
     assert {field.name for field in dataclasses.fields(EngineParams)} == set(CHANGES)
     untouched, _, _ = play(engine, model)
@@ -278,13 +328,14 @@ def test_a_parameter_changes_its_world_alone_and_as_in_mujoco(fresh, name):
     torch.testing.assert_close(changed[others], untouched[others], rtol=0, atol=0)
     assert (changed[1] - untouched[1]).abs().max() > 1e-2
 
-    reference = build_model(CONFIG.robot, CONFIG.engine, CONFIG.ball.table)
+    config = CONFIGS[robot]
+    reference = build_model(config.robot, config.engine, config.ball.table)
     by_hand(reference)
     np.testing.assert_allclose(changed[1, -1], mujocos(reference, targets, shove), atol=5e-3)
 
 
 def mujocos(model, targets, shove):
-    """Velocities (27,) that MuJoCo computes for the motion of :func:`play`."""
+    """Velocities (nv,) that MuJoCo computes for the motion of :func:`play`."""
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
     for target in targets:
@@ -323,20 +374,20 @@ def test_parameters_can_be_taken_back(fresh):
     torch.testing.assert_close(play(engine, model)[0], untouched, rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ENGINES)
-def test_foot_forces_carry_weight_and_change_of_momentum(name):
+def test_foot_forces_carry_weight_and_change_of_momentum(pair):
     """Sum of vertical force x dt = m (g T + change of the centre of mass's velocity), every physics step counted."""
-    engine, model = build(name, physics_dt=0.01, control_dt=0.01)
-    engine.reset(EVERY, standing(model), STILL)
+    name, robot = pair
+    engine, model = build(name, physics_dt=0.01, control_dt=0.01, robot=robot)
+    engine.reset(EVERY, standing(model), still(model))
     impulse, steps = torch.zeros(WORLDS), 25
     for _ in range(steps):
-        engine.advance(hold(engine), STILL)
+        engine.advance(hold(engine, model), still(model))
         impulse += engine.foot_force[..., 2].sum(1) * engine.physics_dt
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = engine.qpos_path[0, -1].numpy(), engine.qvel_path[0, -1].numpy()
     mujoco.mj_forward(model, data)
     mujoco.mj_subtreeVel(model, data)
-    expected = MASS * (9.81 * steps * engine.physics_dt + data.subtree_linvel[1, 2])
+    expected = MASS[robot] * (9.81 * steps * engine.physics_dt + data.subtree_linvel[1, 2])
     np.testing.assert_allclose(impulse, expected, rtol=0.01)
     assert (engine.foot_force[..., 2] > 0).all()
     assert not engine.body_contact.any()
@@ -344,8 +395,8 @@ def test_foot_forces_carry_weight_and_change_of_momentum(name):
 
 def test_no_force_in_the_air(fresh):
     engine, model = fresh
-    engine.reset(EVERY, standing(model, lift=0.3), STILL)
-    engine.advance(hold(engine), STILL)
+    engine.reset(EVERY, standing(model, lift=0.3), still(model))
+    engine.advance(hold(engine, model), still(model))
     assert not engine.foot_force.any()
     np.testing.assert_allclose(engine.qvel_path[:, -1, 2], -9.81 * 0.02, atol=2e-3)  # legs swing a little
 
@@ -354,10 +405,10 @@ def test_a_fall_is_seen_in_the_body_contacts(fresh):
     engine, model = fresh
     lying = standing(model)
     lying[0, 2], lying[0, 3:7] = 0.25, torch.tensor([0.7071068, 0, 0.7071068, 0])  # face down
-    engine.reset(EVERY, lying, STILL)
+    engine.reset(EVERY, lying, still(model))
     for _ in range(15):
-        engine.advance(hold(engine), STILL)
-    touching = {body for body, touched in zip(CONTACT_BODIES, engine.body_contact[0], strict=True) if touched}
+        engine.advance(hold(engine, model), still(model))
+    touching = {body for body, touched in zip(contact_bodies(model), engine.body_contact[0], strict=True) if touched}
     assert "trunk" in touching or "head" in touching
     assert set(engine.body_contact.unique().tolist()) == {0.0, 1.0}
     assert engine.qpos_path[0, -1, 2] > 0.02  # it lies on the floor, not in it
@@ -371,24 +422,31 @@ def test_paddle_in_the_table_is_seen(fresh):
     at = standing(model)
     shift = torch.tensor([-1.3, 0.0, 0.76]) - torch.tensor(data.site("paddle").xpos, dtype=torch.float32)
     at[3, :3] += shift
-    engine.reset(EVERY, at, STILL)
-    engine.advance(hold(engine), STILL)
-    assert engine.body_contact[3, CONTACT_BODIES.index("paddle")] == 1.0
+    engine.reset(EVERY, at, still(model))
+    engine.advance(hold(engine, model), still(model))
+    assert engine.body_contact[3, contact_bodies(model).index("paddle")] == 1.0
     assert not engine.body_contact[:3].any()
 
 
 def beside_the_table(model):
-    """Standing away from it; left forearm, held forwards, 2 mm in its top; thighs 2 mm in its end; paddle in it."""
-    data, at = mujoco.MjData(model), standing(model)
-    at[1, 7 + JOINT_NAMES.index("Left_Shoulder_Pitch")] = -0.8
-    at[1, 7 + JOINT_NAMES.index("Right_Shoulder_Pitch")] = -2.5  # the paddle held high
-    for world, name, place in ((1, "left_forearm", [-1.25, 0.2, 0.758]), (3, "paddle", [-1.3, 0.2, 0.758])):
+    """Standing away from it; left forearm or hand, held forwards, 2 mm in its top; thighs 2 mm in its end; paddle in
+    it."""
+    data, at, joint = mujoco.MjData(model), standing(model), joints(model).index
+    at[1, 7 + joint("Left_Shoulder_Pitch")] = -0.8
+    at[1, 7 + joint("Right_Shoulder_Pitch")] = -2.5  # the paddle held high
+    at[2, 7 + joint("Left_Shoulder_Pitch")] = 1.0  # backwards, away from the table
+    for world, name, place in ((1, free_hand(model)[-1], [-1.25, 0.2, 0.758]), (3, "paddle", [-1.3, 0.2, 0.758])):
         put_lowest(model, data, at[world], name, np.array(place))
     data.qpos[:] = at[2]
     mujoco.mj_kinematics(model, data)
     front = np.array([-1.368 - model.geom("left_thigh").size[0], 0.2, 0.745])
     at[2, :3] += torch.tensor(front - data.geom("left_thigh").xpos, dtype=torch.float32)
     return at
+
+
+def free_hand(model):
+    """Geoms of the left arm that must not touch the table."""
+    return [name for name in ("left_forearm", "left_hand") if name in contact_bodies(model)]
 
 
 def put_lowest(model, data, qpos, name, place):
@@ -402,26 +460,27 @@ def put_lowest(model, data, qpos, name, place):
 
 
 def forces_on_the_robot(model, data):
-    """Sums (2, 3) N of MuJoCo's contact forces between table and robot, and table and left forearm."""
-    table, forearm, sums = model.geom("table").id, model.geom("left_forearm").id, np.zeros((2, 3))
+    """Sums (2, 3) N of MuJoCo's contact forces between table and robot, and table and free hand."""
+    table, sums = model.geom("table").id, np.zeros((2, 3))
+    hand = [model.geom(name).id for name in free_hand(model)]
     for index, contact in enumerate(data.contact[: data.ncon]):
         if table in contact.geom:
             wrench = np.zeros(6)
             mujoco.mj_contactForce(model, data, index, wrench)
             force = contact.frame.reshape(3, 3).T @ wrench[:3] * (1.0 if contact.geom[0] == table else -1.0)
-            sums += np.array([force, force * (forearm in contact.geom)])
+            sums += np.array([force, force * np.isin(contact.geom, hand).any()])
     return sums
 
 
 def test_forces_on_the_table_are_mujocos_contact_forces(fresh):
     engine, model = fresh
     at = beside_the_table(model)
-    engine.reset(EVERY, at, STILL)
-    engine.advance(hold(engine), STILL)
+    engine.reset(EVERY, at, still(model))
+    engine.advance(hold(engine, model), still(model))
     assert engine.table_force.shape == (WORLDS, 2, 2, 3)
     for world in range(WORLDS):
         data = mujoco.MjData(model)
-        data.qpos[:], data.ctrl[:] = at[world], NOMINAL
+        data.qpos[:], data.ctrl[:] = at[world], at[0, 7:]
         for step in range(2):
             mujoco.mj_step(model, data)
             found, expected = engine.table_force[world, step], forces_on_the_robot(model, data)
@@ -435,12 +494,12 @@ def test_forces_on_the_table_are_mujocos_contact_forces(fresh):
     assert whole[3, 2] > whole[3, :2].norm()
 
 
-def test_applied_force_moves_the_base(fresh):
+def test_applied_force_moves_the_base(fresh, robot):
     engine, model = fresh
-    engine.reset(EVERY, standing(model, lift=1.0), STILL)
-    applied = torch.zeros(WORLDS, 27)
-    applied[1, 0] = MASS  # 1 m/s^2 on the centre of mass, less what the swinging joints take
-    engine.advance(hold(engine), applied)
+    engine.reset(EVERY, standing(model, lift=1.0), still(model))
+    applied = still(model)
+    applied[1, 0] = MASS[robot]  # 1 m/s^2 on the centre of mass, less what the swinging joints take
+    engine.advance(hold(engine, model), applied)
     gained = engine.qvel_path[1, -1, :3] - engine.qvel_path[0, -1, :3]
     data = mujoco.MjData(model)
     velocities = []
@@ -454,10 +513,10 @@ def test_applied_force_moves_the_base(fresh):
 
 
 def test_overflow_is_seen():
-    roomy, _ = build("mjwarp")
+    roomy, model = build("mjwarp")
     cramped, _ = build("mjwarp", contacts_per_world=2, constraints_per_world=8)
     for engine in (roomy, cramped):
-        engine.advance(hold(engine), STILL)
+        engine.advance(hold(engine, model), still(model))
     assert not roomy.overflowed()
     assert cramped.overflowed()
 
