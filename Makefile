@@ -4,6 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PYTHON ?= python3.11 python3.12 python3.13 python3.14 python3 python
 ARGS ?=
+WORKERS ?= 2
 
 .DEFAULT_GOAL := help
 .PHONY: help train test test-fast test-long lint bench venv lock clean
@@ -15,10 +16,10 @@ train: venv  ## train a policy: python -m pace.rl.train $(ARGS)
 	$(BIN)/python -m pace.rl.train $(ARGS)
 
 test: venv  ## run the test suite, the fast tests first: pytest $(ARGS)
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(ARGS)
 
 test-fast: venv  ## leave out the end-to-end runs
-	$(BIN)/python -m pytest -m "not slow and not long" $(ARGS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "not slow and not long and not gpu" $(ARGS)
 
 test-long: venv  ## what takes many minutes: wheels, kills, compilations
 	$(BIN)/python -m pytest -m long $(ARGS)

@@ -49,7 +49,7 @@ def bench_config(*overrides: str) -> BenchConfig:
     return parse(compose("bench", [*TINY, *overrides]), BenchConfig)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_whole_quick_run_writes_every_key(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     path = tmp_path / "bench.json"

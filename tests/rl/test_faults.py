@@ -55,7 +55,7 @@ def is_saving(run: Path) -> bool:
     return any((run / FOLDER).glob(".*.tmp")) if (run / FOLDER).is_dir() else False
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_killed_at_any_moment_a_run_resumes_bit_for_bit(tmp_path: Path) -> None:
     """Every second kill falls into the writing of a checkpoint, or close to it."""
     updates, generator = 60, random.Random(5)

@@ -145,7 +145,7 @@ def test_the_type_says_who_may_see_it(folder: Path, group: str, name: str, words
         make_env(2, "native", "cpu", overrides=[f"observation.{group}=[heading,'{name}']"])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_several_processes_and_a_resumed_run_know_the_module(folder: Path, tmp_path: Path) -> None:
     """The module lies in the working folder; each process of the run imports it."""
     arguments = [argument for argument in SMALL if not argument.startswith("samples")]

@@ -133,7 +133,7 @@ def test_every_experiment_gets_every_seed() -> None:
             parse(compose("ablate", [wrong]), AblateConfig)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_real_ablation_and_its_second_call(ablate, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     common = (
