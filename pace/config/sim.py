@@ -9,6 +9,8 @@ from pace.config import plugins
 from pace.config.ball import BallConfig
 from pace.config.base import Range, check_range, require
 
+LEAST_SPEED = 1e-3  # rad/s, of a motor with a torque-speed line: with less its resistance is no number
+
 
 @dataclass
 class JointGroup:
@@ -65,7 +67,7 @@ class RobotConfig:
         require(len(self.foot_sites) == 2, f"robot.foot_sites must name a left and a right sole, got {self.foot_sites}")
         known = self.stall_ratio == 0 or 1 <= self.stall_ratio < math.inf
         require(known, f"robot.stall_ratio must be 0 (no limit) or a number from 1 on, got {self.stall_ratio}")
-        slow = [group.match for group in self.joint_groups if group.max_speed <= 0]
+        slow = [group.match for group in self.joint_groups if group.max_speed < LEAST_SPEED]
         require(not (self.stall_ratio and slow), f"robot.stall_ratio needs the max_speed of the joint groups {slow}")
         require(self.action_clip > 0, "robot.action_clip must be positive")
 

@@ -14,12 +14,16 @@ from torch import Tensor
 
 from pace.arrays.state import Stateful
 from pace.config.base import ConfigError
+from pace.config.limits import TINY
 from pace.config.task import RewardConfig, RewardTerm
 from pace.task import ball_rewards, body_rewards  # noqa: F401  they enter the terms of the package into TERMS
 from pace.task.reward_terms import TERMS, RewardFunction, Term, term
 from pace.task.state import TaskState
 
 __all__ = ["TERMS", "RewardFunction", "RewardManager", "find_term", "term"]
+
+
+DIVISORS = ("sigma", "time", "reach")  # parameters by which terms of the package divide
 
 
 @dataclass
@@ -84,6 +88,7 @@ def find_term(name: str, entry: RewardTerm) -> Term:
         missing, unknown = set(needed) - set(params), set(params) - set(needed)
         what = f"misses {sorted(missing)}" if missing else f"does not know {sorted(unknown)}"
         raise ConfigError(f"reward.terms.{name}.params {what}; it needs {list(needed)}")
-    if not params.get("sigma", 1.0) > 0:
-        raise ConfigError(f"reward.terms.{name}.params.sigma must be positive, got {params['sigma']}")
+    for key in ("sigma",) if needed is None else DIVISORS:
+        if not params.get(key, 1.0) >= TINY:
+            raise ConfigError(f"reward.terms.{name}.params.{key} must be positive, got {params[key]}")
     return function

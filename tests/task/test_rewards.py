@@ -417,7 +417,18 @@ def test_the_manager_sums_weight_times_step_times_scale() -> None:
         ("jump", {}, "unknown reward term 'reward.terms.jump'"),
         ("contact", {}, r"reward.terms.contact.params misses \['reach'\]"),
         ("contact", {"reach": 0.05, "reech": 1.0}, r"does not know \['reech'\]"),
+        ("contact", {"reach": -1e6}, r"params.reach must be positive, got -1000000.0"),  # the reward was infinite
         ("arrival", {"sigma": 0.0}, r"reward.terms.arrival.params.sigma must be positive, got 0.0"),
+        (
+            "arrival",
+            {"sigma": 5e-324},
+            r"reward.terms.arrival.params.sigma must be positive, got 5e-324",
+        ),  # its square is 0
+        (
+            "return_velocity",
+            {"x": 1.5, "y": 0.0, "z": 0.78, "time": 0.0, "reach": 8.0},
+            r"params.time must be positive",
+        ),
     ],
 )
 def test_wrong_terms_are_named(name: str, params: dict[str, float], message: str) -> None:

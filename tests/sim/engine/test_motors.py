@@ -192,6 +192,9 @@ def test_without_the_keys_the_motors_are_those_of_before():
     assert (model.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED).all()
     with pytest.raises(ConfigError, match=r"max_speed.*Hip_Pitch"):
         dataclasses.replace(stored, stall_ratio=2.0)
+    first = dataclasses.replace(CONFIG.robot.joint_groups[0], max_speed=5e-324)
+    with pytest.raises(ConfigError, match=r"max_speed.*Hip_Pitch"):  # with it the motor's resistance is 0
+        dataclasses.replace(CONFIG.robot, joint_groups=[first, *CONFIG.robot.joint_groups[1:]])
     for wrong in (0.5, math.inf, math.nan):
         with pytest.raises(ConfigError, match="stall_ratio"):
             dataclasses.replace(CONFIG.robot, stall_ratio=wrong)
