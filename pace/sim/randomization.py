@@ -207,7 +207,8 @@ class Randomizer(Stateful):
     def sample(self, mask: Tensor) -> None:
         """Resample the parameters of the worlds of ``mask`` (N,) bool."""
         self._sample(mask)
-        self._keep_preset(mask)
+        if self.config.preset_share > 0.0:
+            self._keep_preset(mask)
         self._mount(mask)
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:

@@ -224,3 +224,19 @@ def test_a_reset_resamples_its_world_alone(engine: str) -> None:
 def test_a_body_that_cannot_be_is_refused(override: str, words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         Worlds(load_train_config([override]), 1, "cpu")
+
+
+@pytest.mark.parametrize(("share", "least", "most"), [(0.0, 0.0, 0.0), (0.5, 0.4, 0.6), (1.0, 1.0, 1.0)])
+def test_a_share_of_the_worlds_has_the_presets_ball(share: float, least: float, most: float) -> None:
+    config = load_train_config(["randomization=wide", f"randomization.preset_share={share}", "engine.threads=1"])
+    worlds = Worlds(config, 400, "cpu")
+    kept = torch.stack(
+        [
+            getattr(worlds.ball.params, name) == torch.tensor(float(getattr(config.ball, name)))
+            for name in SAMPLED_BALL_PARAMS
+            if len(set(drawn_range(name))) == 2  # the others have one value anyway
+        ]
+    )
+    whole = kept.all(0)
+    assert least <= float(whole.float().mean()) <= most
+    assert not kept[:, ~whole].any()  # a world has all of the preset, or none
