@@ -51,11 +51,12 @@ def choose(composed: DictConfig, machine: Machine) -> tuple[DictConfig, dict[str
     """The configuration with values in place of ``auto``, and those that were chosen, by key."""
     found = OmegaConf.create(OmegaConf.to_container(composed))
     assert isinstance(found, DictConfig)
-    values = _values(machine)
+    given = _given(machine)
+    values = _values(given, machine)
     chosen = {key: values[key] for key in KEYS if key in values and OmegaConf.select(found, key) == AUTO}
     for key, value in chosen.items():
         OmegaConf.update(found, key, value)
-    _choose_the_end(found, _given(machine))
+    _choose_the_end(found, given)
     return found, chosen
 
 
@@ -83,8 +84,7 @@ def _choose_the_end(config: DictConfig, given: DeviceValues) -> None:
         config.minutes = given.minutes if samples in (AUTO, math.inf) else 0.0
 
 
-def _values(machine: Machine) -> dict[str, Any]:
-    given = _given(machine)
+def _values(given: DeviceValues, machine: Machine) -> dict[str, Any]:
     worlds = _worlds_that_fit(given, machine.memory) * machine.count
     values: dict[str, Any] = {"num_worlds": worlds, "algo.steps": given.steps, "algo.minibatches": given.minibatches}
     if machine.bf16 is not None:

@@ -111,9 +111,8 @@ LIMITS: dict[str, dict[str, Limits]] = {
         "closing_speed": (TINY, 100.0), "largest": (TINY, 100.0),
     },
     "RubberMemoryConfig": {
-        "prior": AMPLITUDE, "prior_hits": (TINY, 1e6), "hits": (1.0, 1e6), "reach": (TINY, 100.0),
-        "closing_speed": (TINY, 100.0), "largest": (TINY, 100.0), "bounce_spin": (0.0, 1e4), "radius": (TINY, 1.0),
-        "prior_grip": AMPLITUDE, "slip": (TINY, 100.0), "largest_grip": (TINY, 100.0),
+        "bounce_spin": (0.0, 1e4), "radius": (TINY, 1.0), "prior_grip": AMPLITUDE, "slip": (TINY, 100.0),
+        "largest_grip": (TINY, 100.0),
     },
     "DelayEstimateConfig": {"prior": SECONDS, "prior_worth": (TINY, 1e6), "smoothing": SHARE, "fading": SHARE},
     "AttitudeEstimateConfig": {"gain": SHARE},

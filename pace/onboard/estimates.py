@@ -57,6 +57,7 @@ class Entry:
     frames: int = 0
 
 
+_RETURNS = ("track", "turned", "paddle_position", "paddle_normal")
 _TURNS = ("base_angular_velocity", "projected_gravity", "heading")
 
 #: Name of each estimate, as in checkpoints and in the exported file's state -> its entry.
@@ -65,7 +66,7 @@ ESTIMATES: dict[str, Entry] = {
         "return_memory",
         ReturnMemoryConfig,
         ReturnMemory,
-        ("track", "turned", "paddle_position", "paddle_normal"),
+        _RETURNS,
         {"last_return": "last_return"},
         frames=returns.FRAMES,
     ),
@@ -73,7 +74,7 @@ ESTIMATES: dict[str, Entry] = {
         "rubber_memory",
         RubberMemoryConfig,
         RubberMemory,
-        ("track", "turned", "paddle_position", "paddle_normal"),
+        _RETURNS,
         {"last_rubber": "last_rubber"},
         frames=returns.FRAMES,
     ),

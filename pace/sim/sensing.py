@@ -123,10 +123,9 @@ def _sense(
             row[mocap + column] += _late(line[world], delay[world], column)
         elif reset == 1:
             row[mocap + column] = 0.0
-    if reset == 1 and not seen:
-        ball_age[world] = UNSEEN - control_dt
     ball_new[world] = seen
-    ball_age[world] = wp.where(seen, delay[world] * control_dt, ball_age[world] + control_dt)
+    unseen_for = wp.where(reset == 1, UNSEEN, ball_age[world] + control_dt)
+    ball_age[world] = wp.where(seen, delay[world] * control_dt, unseen_for)
 
 
 class Sensing(Stateful):

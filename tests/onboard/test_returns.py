@@ -14,55 +14,28 @@ from pace.onboard.returns import ReturnMemory
 from pace.sim.ball.aero import GRAVITY
 from pace.task.env import make_env
 from pace.task.observations import check_policy
-from tests.helpers.estimates import Running, estimated
+from tests.helpers.estimates import estimated
 from tests.helpers.fakes import config
+from tests.helpers.hits import DT, POINT, Rally
 
-DT = 0.02
 PRIOR, PRIOR_HITS = 0.65, 0.5
 CONFIG = ReturnMemoryConfig(PRIOR, PRIOR_HITS, hits=4.0, reach=0.5, closing_speed=2.0, largest=1.2)
 BALL, PADDLE = torch.tensor([-5.0, 0.3, -0.5]), torch.tensor([1.5, -0.2, 0.4])  # m/s before the hit
 NORMAL = torch.nn.functional.normalize(torch.tensor([0.9, 0.2, 0.3]), dim=0)
-POINT = torch.tensor([-1.6, -0.2, 1.0])  # m, where they meet
 
 
-class Rally:
-    """One world's memory, and made-up hits to feed it with."""
+class Hits(Rally):
+    """Hits of a paddle without friction."""
 
     def __init__(self) -> None:
-        self.track, self.turned = torch.zeros(1, 15), torch.zeros(1, dtype=torch.bool)
-        self.paddle, self.normal = torch.zeros(1, 3), NORMAL.repeat(1, 1)
-        self.memory = Running(
-            ReturnMemory(CONFIG, DT, 0),
-            lambda: {
-                "track": self.track,
-                "turned": self.turned,
-                "paddle_position": self.paddle,
-                "paddle_normal": self.normal,
-            },
-        )
+        super().__init__(ReturnMemory(CONFIG, DT, 0), BALL, NORMAL)
 
     def hit(self, restitution: float, paddle: Tensor = PADDLE, away: Tensor | None = None, last: int = 10) -> Tensor:
-        """Play a ball that is hit one step before it is seen to turn, up to instant ``last``; its velocity after it."""
+        """See :meth:`Rally.play`; returns the ball's velocity after the hit."""
         closing = torch.dot(BALL - paddle, NORMAL)
         after = BALL - (1.0 + restitution) * closing * NORMAL
-        gravity = torch.tensor([0.0, 0.0, -GRAVITY])
-        path = []
-        for step in range(-5, 6):  # 0 is the hit
-            time = step * DT
-            velocity = BALL if step <= 0 else after
-            path.append(POINT + velocity * time + 0.5 * gravity * time**2)
-        for newest in range(4, last + 1):
-            self.track.copy_(torch.stack(path[newest - 4 : newest + 1]).view(1, 15))
-            time = (newest - 5) * DT
-            self.paddle.copy_(POINT + paddle * time if away is None else away)
-            self.turned.fill_(newest >= 6)  # one step after the hit
-            self.memory.update()
+        self.play(after, paddle, away, last)
         return after
-
-    def next_ball(self) -> None:
-        self.track.copy_(torch.tensor([1.35, 0.0, 1.03]).repeat(1, 5))
-        self.turned.fill_(False)
-        self.memory.update()
 
     @property
     def estimate(self) -> float:
@@ -71,7 +44,7 @@ class Rally:
 
 @pytest.mark.parametrize("restitution", [0.38, 0.65, 0.87])
 def test_one_hit_moves_the_prior_by_its_weight(restitution: float) -> None:
-    rally = Rally()
+    rally = Hits()
     assert rally.memory["last_return"].abs().max() == 0.0
     after = rally.hit(restitution)
     assert rally.estimate == pytest.approx((PRIOR * PRIOR_HITS + restitution) / (PRIOR_HITS + 1.0), abs=1e-3)
@@ -82,7 +55,7 @@ def test_one_hit_moves_the_prior_by_its_weight(restitution: float) -> None:
 
 
 def test_many_hits_come_to_the_truth_and_old_ones_fade() -> None:
-    rally = Rally()
+    rally = Hits()
     for restitution, rounds in ((0.45, 12), (0.8, 12)):
         for _ in range(rounds):
             rally.next_ball()
@@ -92,7 +65,7 @@ def test_many_hits_come_to_the_truth_and_old_ones_fade() -> None:
 
 
 def test_what_is_no_hit_of_the_paddle_teaches_nothing() -> None:
-    rally = Rally()
+    rally = Hits()
     rally.hit(0.8, away=POINT - torch.tensor([0.6, 0.0, 0.0]))  # turned by the net, say
     assert rally.memory["last_return"].abs().max() == 0.0
     rally.next_ball()
@@ -103,7 +76,7 @@ def test_what_is_no_hit_of_the_paddle_teaches_nothing() -> None:
 
 
 def test_a_new_ball_before_the_return_was_seen_leaves_the_memory_as_it_was() -> None:
-    rally = Rally()
+    rally = Hits()
     rally.hit(0.8)
     before = rally.memory["last_return"].clone()
     for last in (6, 7):  # seen to turn, one step after that; in the next its velocity would have been seen
@@ -115,7 +88,7 @@ def test_a_new_ball_before_the_return_was_seen_leaves_the_memory_as_it_was() -> 
 
 
 def test_it_can_be_forgotten_world_by_world() -> None:
-    rally = Rally()
+    rally = Hits()
     rally.hit(0.8)
     rally.memory.restart(torch.tensor([False]))
     assert rally.memory.state.abs().max() > 0.0

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
 
 from pace.config.base import ConfigError
-from pace.config.task import RubberMemoryConfig
 from pace.onboard.rubber import RubberMemory
-from pace.sim.ball.aero import GRAVITY
 from pace.task.env import make_env
 from pace.task.observations import check_policy
-from tests.helpers.estimates import Running, estimated
+from tests.helpers.estimates import estimated
 from tests.helpers.fakes import config
+from tests.helpers.hits import DT, Rally
 
-DT, PRIOR = 0.02, 0.7
+PRIOR = 0.7
 NUMBERS = config("observation=rubber").observation.rubber_memory
 BALL, PADDLE = torch.tensor([-4.0, 0.3, -0.5]), torch.tensor([1.5, -0.2, 0.4])  # m/s before the hit
 NORMAL = torch.nn.functional.normalize(torch.tensor([0.9, 0.2, 0.3]), dim=0)
-POINT = torch.tensor([-1.6, -0.2, 1.0])  # m, where they meet
 
 
 def returned(restitution: float, share: float, topspin: float) -> Tensor:
@@ -32,33 +32,17 @@ def returned(restitution: float, share: float, topspin: float) -> Tensor:
     return BALL - (1.0 + restitution) * (relative @ NORMAL) * NORMAL - share * slip
 
 
-class Rally:
-    """One world's memory, fed with hits; the normal of its paddle points this way (1) or the other (-1)."""
+class Hits(Rally):
+    """Hits of a paddle whose normal points this way (1) or the other (-1)."""
 
-    def __init__(self, side: float = 1.0) -> None:
+    def __init__(self, side: float = 1.0, **changes: float) -> None:
         assert NUMBERS is not None
-        self.numbers, self.side = NUMBERS, side
-        self.track, self.turned = torch.zeros(1, 15), torch.zeros(1, dtype=torch.bool)
-        self.paddle, self.normal = torch.zeros(1, 3), side * NORMAL.repeat(1, 1)
-        signals = {"track": self.track, "turned": self.turned}
-        pose = {"paddle_position": self.paddle, "paddle_normal": self.normal}
-        self.reads = lambda: signals | pose
-        self.memory = Running(RubberMemory(self.numbers, DT, 0), self.reads)
+        self.numbers = replace(NUMBERS, **changes)
+        super().__init__(RubberMemory(self.numbers, DT, 0), BALL, side * NORMAL)
 
     def hit(self, restitution: float, share: float, topspin: float) -> None:
-        after, gravity = returned(restitution, share, topspin), torch.tensor([0.0, 0.0, -GRAVITY])
-        path = []
-        for step in range(-5, 6):  # 0 is the hit
-            time, velocity = step * DT, BALL if step <= 0 else after
-            path.append(POINT + velocity * time + 0.5 * gravity * time**2)
-        for newest in range(4, 11):
-            self.track.copy_(torch.stack(path[newest - 4 : newest + 1]).view(1, 15))
-            self.paddle.copy_(POINT + PADDLE * (newest - 5) * DT)
-            self.turned.fill_(newest >= 6)
-            self.memory.update()
-        self.track.copy_(torch.tensor([1.35, 0.0, 1.03]).repeat(1, 5))
-        self.turned.fill_(False)
-        self.memory.update()
+        self.play(returned(restitution, share, topspin), PADDLE)
+        self.next_ball()
 
     def seen(self, column: int) -> float:
         return float(self.memory["last_rubber"][0, column])
@@ -67,7 +51,7 @@ class Rally:
 @pytest.mark.parametrize("side", [1.0, -1.0])
 @pytest.mark.parametrize("share", [0.1, 0.4, 0.73])
 def test_one_hit_moves_both_priors_by_their_weights(share: float, side: float) -> None:
-    rally = Rally(side)
+    rally = Hits(side)
     assert rally.memory["last_rubber"].abs().max() == 0.0
     rally.hit(0.6, share, rally.numbers.bounce_spin)
     weight = 1.0 / (rally.numbers.prior_hits + 1.0)
@@ -77,7 +61,7 @@ def test_one_hit_moves_both_priors_by_their_weights(share: float, side: float) -
 
 
 def test_spin_that_is_not_seen_leaves_the_mean() -> None:
-    rally = Rally()
+    rally = Hits()
     single = []
     for spin in 10 * (-40.0, 40.0):
         rally.hit(0.76, 0.6, rally.numbers.bounce_spin + spin)
@@ -87,9 +71,7 @@ def test_spin_that_is_not_seen_leaves_the_mean() -> None:
 
 
 def test_a_hit_without_slip_tells_no_share() -> None:
-    rally = Rally()
-    without = RubberMemoryConfig(**vars(rally.numbers) | {"slip": 50.0})
-    rally.memory = Running(RubberMemory(without, DT, 0), rally.reads)
+    rally = Hits(slip=50.0)
     rally.hit(0.6, 0.4, 150.0)
     assert rally.seen(3) != 0.0
     assert (rally.seen(5), rally.seen(6)) == (0.0, 0.0)

@@ -15,6 +15,7 @@ from pace.rl import make_env
 from pace.task.env import TableTennisEnv
 from pace.task.game import Outcome
 from tests.helpers.fakes import config
+from tests.helpers.hits import aim_at_paddle
 
 N = 8
 
@@ -204,15 +205,6 @@ def test_warmup_serves_are_not_counted() -> None:
         finish_serve(env, everyone)
         counts.append(float(env.pop_statistics()["serves"]))
     assert counts == [0.0, 0.0, N]
-
-
-def aim_at_paddle(env: TableTennisEnv, speed: float = 6.0) -> None:
-    """Put the ball of every world 10 cm in front of the paddle's face, flying into it, after its bounce."""
-    robot, ball = env.worlds.robot, env.worlds.ball
-    normal = robot.paddle_normal * robot.paddle_normal[:, :1].sign()
-    ball.position.copy_(robot.paddle_position + 0.1 * normal)
-    ball.velocity.copy_(robot.paddle_velocity - speed * normal)
-    env.game.referee.own_bounces.fill_(1)
 
 
 def test_a_hit_is_seen_forecast_and_paid_in_its_step() -> None:

@@ -29,6 +29,7 @@ from pace.task.observations import (
 )
 from pace.task.signals import ActorSignals
 from tests.helpers.fakes import CPU, config, fake_state, fake_worlds
+from tests.helpers.hits import aim_at_paddle
 
 NO = torch.zeros(1, dtype=torch.bool)
 YES = torch.ones(1, dtype=torch.bool)
@@ -223,15 +224,6 @@ SHORT = ("engine=native", "engine.threads=1", "observation=memory", "serve.max_d
 PAUSED = ("serve.pause=[0.0,0.2]", "serve.first_pause=[0.0,0.2]", "serve.pause_ball={lies:0.4,carried:0.3,hidden:0.3}")
 
 
-def strike(env: TableTennisEnv) -> None:
-    """Put the ball of every other world in front of its paddle, flying into it after a bounce."""
-    robot, ball, every_other = env.worlds.robot, env.worlds.ball, slice(None, None, 2)
-    normal = robot.paddle_normal * robot.paddle_normal[:, :1].sign()
-    ball.position[every_other] = (robot.paddle_position + 0.1 * normal)[every_other]
-    ball.velocity[every_other] = (robot.paddle_velocity - 6.0 * normal)[every_other]
-    env.game.referee.own_bounces[every_other] = 1
-
-
 @pytest.mark.parametrize("more", [(), PAUSED, ("sensing=mocap", *PAUSED)], ids=["wide", "pauses", "mocap"])
 def test_the_actor_sees_launches_hits_and_resets_through_sensed_frames_alone(more: tuple[str, ...]) -> None:
     """Other modules, given only the readings, make the same policy observation, bit for bit."""
@@ -253,7 +245,7 @@ def test_the_actor_sees_launches_hits_and_resets_through_sensed_frames_alone(mor
     launches, begun, hits = 0, 0, 0
     for step in range(70):
         if step % 10 == 5:
-            strike(env)
+            aim_at_paddle(env, slice(None, None, 2))
         env.advance(0.3 * torch.randn(8, 21))
         hits += int(env.game.referee.hit_now.sum())
         read()
