@@ -20,6 +20,8 @@ from pace.sim.robot_state import RobotArrays, RobotState
 #: Columns of a motion-capture frame: base position 3, ball position 3, heading 2; 1 in a new ball's first frame; 1 if
 #: the ball is in view.
 FRAME_COLUMNS = 10
+#: Of the newest frames with the base and with the ball: s since their capture; they arrived in this step.
+STAMPS = ("base_age", "base_new", "ball_age", "ball_new")
 BASE, BALL, HEADING, LAUNCHED, SEEN = wp.constant(0), wp.constant(3), wp.constant(6), wp.constant(8), wp.constant(9)
 
 
@@ -86,6 +88,7 @@ def _sense(
     amplitude: wp.array[wp.float32],
     line: wp.array3d[wp.float32],
     sensed: wp.array2d[wp.float32],
+    base_age: wp.array[wp.float32],
     ball_age: wp.array[wp.float32],
     ball_new: wp.array[wp.bool],
 ):
@@ -123,6 +126,7 @@ def _sense(
             row[mocap + column] += _late(line[world], delay[world], column)
         elif reset == 1:
             row[mocap + column] = 0.0
+    base_age[world] = delay[world] * control_dt
     ball_new[world] = seen
     unseen_for = wp.where(reset == 1, UNSEEN, ball_age[world] + control_dt)
     ball_age[world] = wp.where(seen, delay[world] * control_dt, unseen_for)
@@ -142,11 +146,12 @@ class Sensing(Stateful):
     Attributes: ``base_angular_velocity`` (N, 3) rad/s body frame, ``projected_gravity`` (N, 3), ``joint_position``
     (N, J) rad from the nominal pose, ``joint_velocity`` (N, J) rad/s, ``base_position`` (N, 3) m,
     ``ball_position`` (N, 3) m, ``heading`` (N, 2), ``base_shift_noise`` (N, 2) m for quantities computed from sensed
-    values; ``ball_age`` (N,) s since the sensed ball's frame was captured, ``ball_new`` (N,) bool, that frame arrived
-    in this step; world frame unless stated.
+    values; ``base_age`` (N,) s since the frame of base position and heading was captured, ``ball_age`` (N,) s since
+    that of the ball was, ``base_new`` and ``ball_new`` (N,) bool, that frame arrived in this step; world frame unless
+    stated.
     """
 
-    STATE = ("_nominal", "_amplitude", "_sensed", "_line", "_delay", "_scale", "ball_age", "ball_new")
+    STATE = ("_nominal", "_amplitude", "_sensed", "_line", "_delay", "_scale", *STAMPS)
 
     def __init__(
         self,
@@ -178,7 +183,8 @@ class Sensing(Stateful):
         views = torch.split(self._sensed, list(sizes.values()), dim=1)
         self.base_angular_velocity, self.projected_gravity, self.joint_position, self.joint_velocity = views[:4]
         self.base_position, self.ball_position, self.heading, self.base_shift_noise = views[4:]
-        self.ball_age = torch.zeros(num_worlds, device=device)
+        self.base_age, self.ball_age = torch.zeros(2, num_worlds, device=device)
+        self.base_new = torch.ones(num_worlds, dtype=torch.bool, device=device)
         self.ball_new = torch.ones(num_worlds, dtype=torch.bool, device=device)
         frames = max(2, math.ceil(self._delays[1]) + 1)
         self._line = torch.zeros(num_worlds, frames, FRAME_COLUMNS, device=device)
@@ -193,8 +199,9 @@ class Sensing(Stateful):
     def _make_mocap(self, config: SensingConfig, first: int) -> Mocap:
         """Motion capture with frames of its own, which writes the columns from ``first`` on."""
         columns = slice(first, first + LAUNCHED)
-        own = (self._amplitude[columns], self._sensed[:, columns], self.ball_age, self.ball_new)
-        return Mocap(config, self._control_dt, self._delay, self._scale, *own)
+        own = (self._amplitude[columns], self._sensed[:, columns])
+        stamps = {name: getattr(self, name) for name in STAMPS}
+        return Mocap(config, self._control_dt, self._delay, self._scale, *own, stamps)
 
     def state_tensors(self) -> dict[str, Tensor]:
         """See :class:`pace.arrays.state.Stateful`; those of motion capture where it has frames of its own."""
@@ -227,7 +234,7 @@ class Sensing(Stateful):
         sampled = {"seed": self._seed, "delays": self._delays, "scales": self._scales, "amplitude": self._amplitude}
         truth = {"robot": robot, "ball_position": ball_position, "in_view": in_view, "nominal": self._nominal}
         truth |= {"control_dt": self._control_dt, "own_frames": int(self._mocap is not None)}
-        kept = {"ball_age": self.ball_age, "ball_new": self.ball_new}
+        kept = {"base_age": self.base_age, "ball_age": self.ball_age, "ball_new": self.ball_new}
         kept |= {"delay": self._delay, "scale": self._scale, "line": self._line, "sensed": self._sensed}
         given = sampled | truth | kept
         launches = [[MaskedLaunch(_sense, self._num_worlds, self._device, reset=reset, **given)] for reset in (0, 1)]

@@ -21,17 +21,21 @@ PERIOD = 1.0 / 150.0  # s
 
 
 class Filmed:
-    """A ball that moves along x, and what was sensed of it in each step.
+    """A ball and a robot that move along x, and what was sensed of one of them in each step.
 
     Attributes, (STEPS, WORLDS): ``error`` (..., 3) m to the truth at capture, ``age`` s, ``new``, ``stamp`` s.
     """
 
-    def __init__(self, speed: float = 1.0, delay: tuple[float, float] = (0.004, 0.004), **mocap: Any) -> None:
+    def __init__(
+        self, speed: float = 1.0, delay: tuple[float, float] = (0.004, 0.004), part: str = "ball", **mocap: Any
+    ) -> None:
         numbers = replace(MocapConfig(rate=150.0), **mocap)
         clean = replace(config("sensing=clean").sensing, mocap_delay=list(delay), mocap=numbers)
         self.sensing = Sensing(clean, WORLDS, CPU, DT, torch.zeros(21), torch.Generator().manual_seed(0))
-        self.robot, self.speed = fake_robot(WORLDS), speed
+        self.robot, self.speed, self.part = fake_robot(WORLDS), speed, part
         self.ball = torch.tensor([0.0, 0.1, 1.0]).repeat(WORLDS, 1)
+        if part == "base":
+            self.robot.base_position.copy_(self.ball)
         self.nobody = torch.zeros(WORLDS, dtype=torch.bool)
         self.sensing.reset(~self.nobody, self.robot, self.ball)
         self.step = 0
@@ -41,11 +45,15 @@ class Filmed:
         for _ in range(steps):
             self.step += 1
             self.ball[:, 0] = self.speed * self.step * DT
+            if self.part == "base":
+                self.robot.base_position.copy_(self.ball)
             self.sensing.update(self.robot, self.ball, self.nobody)
-            age, stamp = self.sensing.ball_age.clone(), self.step * DT - self.sensing.ball_age
-            truth = self.ball.clone()
+            position, age, new = (
+                getattr(self.sensing, f"{self.part}_{signal}").clone() for signal in ("position", "age", "new")
+            )
+            stamp, truth = self.step * DT - age, self.ball.clone()
             truth[:, 0] = (self.speed * stamp).clamp(min=0.0)  # it rested until the first step
-            rows.append((self.sensing.ball_position - truth, age, self.sensing.ball_new.clone(), stamp))
+            rows.append((position - truth, age, new, stamp))
         self.error, self.age, self.new, self.stamp = (torch.stack(row) for row in zip(*rows, strict=True))
         return self
 
@@ -55,8 +63,9 @@ class Filmed:
         return (later - self.stamp[4:-1])[self.new[5:]]
 
 
-def test_frames_have_their_rate_and_are_held_in_between() -> None:
-    filmed = Filmed(rate=30.0).run()
+@pytest.mark.parametrize("part", ["ball", "base"])
+def test_frames_have_their_rate_and_are_held_in_between(part: str) -> None:
+    filmed = Filmed(part=part, rate=30.0).run()
     assert filmed.new.sum(0).tolist() == pytest.approx([30.0 * STEPS * DT] * WORLDS, abs=1.1)
     torch.testing.assert_close(filmed.between(), torch.full_like(filmed.between(), 1.0 / 30.0), atol=1e-4, rtol=0.0)
     # each position is that of the time it was captured, also while it is held
@@ -65,8 +74,9 @@ def test_frames_have_their_rate_and_are_held_in_between() -> None:
     assert len(first.unique()) > 1  # the cameras of different worlds do not start together
 
 
-def test_three_frames_a_step_and_the_newest_that_arrived() -> None:
-    filmed = Filmed(delay=(0.0, 0.030)).run(50)
+@pytest.mark.parametrize("part", ["ball", "base"])
+def test_three_frames_a_step_and_the_newest_that_arrived(part: str) -> None:
+    filmed = Filmed(part=part, delay=(0.0, 0.030)).run(50)
     late = filmed.sensing.delay * DT
     waited = filmed.age[5:] - late
     assert bool(filmed.new[5:].all())
@@ -75,8 +85,9 @@ def test_three_frames_a_step_and_the_newest_that_arrived() -> None:
     assert float(waited.mean()) == pytest.approx(PERIOD / 2, abs=3e-4)
 
 
-def test_the_delay_of_frames_jitters_in_its_range() -> None:
-    filmed = Filmed(rate=20.0, delay=(0.004, 0.004), jitter=[0.0, 0.026]).run()
+@pytest.mark.parametrize("part", ["ball", "base"])
+def test_the_delay_of_frames_jitters_in_its_range(part: str) -> None:
+    filmed = Filmed(part=part, rate=20.0, delay=(0.004, 0.004), jitter=[0.0, 0.026]).run()
     found = filmed.age[filmed.new]  # delay, jitter, and the wait for the control step
     assert 0.004 <= float(found.min()) < 0.0055
     assert 0.048 < float(found.max()) <= 0.004 + 0.026 + DT + 1e-5
@@ -84,17 +95,19 @@ def test_the_delay_of_frames_jitters_in_its_range() -> None:
     assert float(found.std()) == pytest.approx(math.sqrt((0.026**2 + DT**2) / 12), rel=0.02)
 
 
-def test_white_noise() -> None:
-    error = Filmed(white_noise=0.0019).run().error
+@pytest.mark.parametrize("part", ["ball", "base"])
+def test_white_noise(part: str) -> None:
+    error = Filmed(part=part, white_noise=0.0019).run().error
     assert error.std(0).flatten().tolist() == pytest.approx([0.0019] * 3 * WORLDS, rel=0.15)
     assert float(error.std()) == pytest.approx(0.0019, rel=0.01)
     assert float((error[1:] * error[:-1]).mean()) / 0.0019**2 == pytest.approx(0.0, abs=0.01)
     assert float((error[..., 0] * error[..., 1]).mean()) / 0.0019**2 == pytest.approx(0.0, abs=0.01)
 
 
-def test_slow_noise_has_its_deviation_and_its_time() -> None:
+@pytest.mark.parametrize("part", ["ball", "base"])
+def test_slow_noise_has_its_deviation_and_its_time(part: str) -> None:
     """Source of the numbers: 5.2 mm, rho 0.946 at 300 Hz."""
-    error = Filmed(slow_noise=0.0052, slow_noise_time=0.06).run().error
+    error = Filmed(part=part, slow_noise=0.0052, slow_noise_time=0.06).run().error
     assert float(error.std()) == pytest.approx(0.0052, rel=0.02)
     per_world = error.std(0).mean(1)
     assert float(per_world.min()) > 0.004
@@ -104,8 +117,9 @@ def test_slow_noise_has_its_deviation_and_its_time() -> None:
     assert error[0].std() == pytest.approx(0.0052, rel=0.1)  # from the beginning
 
 
-def test_frames_are_lost_singly() -> None:
-    filmed = Filmed(rate=20.0, lost=0.3).run()
+@pytest.mark.parametrize("part", ["ball", "base"])
+def test_frames_are_lost_singly(part: str) -> None:
+    filmed = Filmed(part=part, rate=20.0, lost=0.3).run()
     arrived = filmed.new.float().sum(0) / (20.0 * STEPS * DT)
     assert float(arrived.mean()) == pytest.approx(0.7, abs=0.01)
     assert float(arrived.std()) == pytest.approx(math.sqrt(0.3 * 0.7 / 200), rel=0.2)  # each frame by itself
@@ -114,8 +128,9 @@ def test_frames_are_lost_singly() -> None:
     assert float((missing == 1).float().mean()) == pytest.approx(0.3 * 0.7, abs=0.01)
 
 
-def test_frames_are_lost_in_runs() -> None:
-    filmed = Filmed(gap_rate=0.5, gap=[0.05, 0.1]).run()
+@pytest.mark.parametrize("part", ["ball", "base"])
+def test_frames_are_lost_in_runs(part: str) -> None:
+    filmed = Filmed(part=part, gap_rate=0.5, gap=[0.05, 0.1]).run()
     between = filmed.between()
     runs = between[between > 0.03]
     assert len(runs) / (WORLDS * STEPS * DT) == pytest.approx(0.5 / (1.0 + 0.5 * 0.075), rel=0.06)
@@ -155,6 +170,8 @@ def test_out_of_view_no_frame_holds_the_ball_but_the_base_is_seen() -> None:
     assert float((filmed.sensing.ball_position - before)[~hidden, 0].min()) > 0.2
     assert float(filmed.sensing.base_position[:, 0].min()) > -1.6
     assert float(filmed.sensing.ball_age[hidden].min()) > 3 * DT - 1e-4
+    assert bool(filmed.sensing.base_new.all())
+    assert float(filmed.sensing.base_age.max()) < 0.004 + PERIOD + 1e-5
 
 
 def test_no_frame_lies_between_two_balls() -> None:
@@ -188,6 +205,7 @@ def test_its_state_resumes_exactly() -> None:
     other.step = one.step
     one.run(30)
     other.run(30)
+    assert torch.equal(one.sensing.base_age, other.sensing.base_age)
     for name in ("error", "age", "new"):
         assert torch.equal(getattr(one, name), getattr(other, name))
 
