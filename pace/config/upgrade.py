@@ -18,7 +18,7 @@ from pace.config.task import SPINS
 
 #: Format that this version writes. 1: version 0.1.0 up to commit 43400ac; 2: up to 72b96bb, before the true world;
 #: 3: up to 8d3869a, before gears had play and motors the maker's numbers; 4: up to cd18fd6, before the free hand on the
-#: table had its own outcome; 5: up to 027ac53, before the frame with the base had an age.
+#: table had its own outcome; 5: up to 027ac53, before the frame with the base had an age and a good serve was repeated.
 FORMAT = 6
 
 #: Landing target of a saved configuration without one (released configuration).
@@ -212,6 +212,13 @@ def stamp_the_base(state: Saved) -> None:
         env["sensing.base_new"] = over.new_ones(over.shape)
 
 
+def remember_a_good_serve(state: Saved) -> None:
+    """A world repeats its last serve that landed well if it finds no other: so far, the last that it sampled."""
+    for env in _environments(state):
+        env["serves.good"] = env["serves.sampled"].clone()
+        env["serves.good_about"] = env["serves.sampled"].new_zeros(len(env["serves.sampled"]), 3)
+
+
 def _environments(state: Saved) -> Iterator[Saved]:
     """The saved tensors of each process's environment; none in a state without processes."""
     for process in state.get("processes") or ():
@@ -249,6 +256,7 @@ STATE_UPGRADES: list[Upgrade] = [
     (4, add_the_body),
     (5, count_the_free_hand),
     (6, stamp_the_base),
+    (6, remember_a_good_serve),
 ]
 
 

@@ -28,7 +28,7 @@ STATE = {
     "game.target": "apex apex_time arriving idle_point playable point something_to_hit time",
     "policy": "frame observation",
     "rewards": "_weights reward sums values",
-    "serves": "sampled",
+    "serves": "good good_about sampled",
     "sensing": "_amplitude _delay _line _nominal _scale _sensed ball_age ball_new base_age base_new",
     "state": (
         "action apex arrival base_error feet_distance foot_contact foot_load lost mocap_delay nominal "
