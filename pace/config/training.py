@@ -40,10 +40,10 @@ class AlgoConfig:
     max_grad_norm: float
     observation_clip: float
     last_layer_gain: float
-    # mixed (bf16, and fp32 from a std of fp32_below on), bf16, fp32; auto: mixed if the hardware supports it, else fp32
+    # mixed (bf16; the actor in fp32 from a std of fp32_below on), bf16, fp32; auto: mixed if the hardware supports it, else fp32
     autocast: str
     later_steps: list[SchedulePoint] = field(default_factory=list)  # in place of steps, from a place in the run on
-    fp32_below: float = 0.0  # mean std of the policy below which autocast=mixed computes in float32
+    fp32_below: float = 0.0  # mean std of the policy below which with autocast=mixed the actor is float32
     algorithm: str = "ppo"  # or a class from outside: my_module:MyAlgorithm
     params: dict[str, float] = field(default_factory=dict)  # numbers of an algorithm from outside
     skips: int = 0  # updates in a row that are skipped because they are not finite, before the run stops

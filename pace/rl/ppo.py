@@ -274,7 +274,7 @@ class AsymmetricPPO:
         agent = self.agent
         number_format = str(agent.observation_dtype).removeprefix("torch.")
         if agent.observation_dtype != torch.float32 and agent.fp32_below > 0.0:
-            number_format += f" (float32 below a std of {agent.fp32_below:g})"
+            number_format += f" (the actor in float32 below a std of {agent.fp32_below:g})"
         return f"networks in {number_format}"
 
     def state_dict(self) -> dict[str, Any]:
