@@ -141,6 +141,10 @@ LIMITS: dict[str, dict[str, Limits]] = {
         "observation_clip": (TINY, 1e9), "last_layer_gain": FACTOR, "fp32_below": AMPLITUDE, "params": ANY,
         "skips": (0, 10**6),
     },
+    "JudgeConfig": {
+        "serves": (0, 10**7), "worlds": (1, 10**6), "last_serves": (0, 10**7), "last_worlds": (1, 10**6),
+        "warmup_serves": (0, 1000), "physics_dt": STEP, "after": (0.0, 1e6), "video": (0.0, 1e5),
+    },
     "PlanConfig": {
         "warm_up": (0, 10**6), "updates": COUNT, "seconds": SECONDS, "samples": (1.0, 1e15),
     },

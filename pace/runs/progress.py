@@ -20,6 +20,8 @@ RATES = {  # column: label, factor, digits, unit
     "fall_rate": ("falls", 1.0, 3, "/s"),
     "predictor_rmse_cm": ("predictor", 1.0, 1, " cm"),
 }
+#: Columns of a judgement without exploration, in words.
+JUDGED = {"eval_hit": "judged: hit {:.0f}", "eval_success": "return {:.0f} %"}
 #: Column of a fault -> its total in words.
 FAULTS = {"diverged": "{} worlds diverged", "skipped": "{} updates skipped"}
 WINDOW = 25  # updates over which the shown rates are taken
@@ -61,6 +63,7 @@ class Progress:
         self.recent: deque[dict[str, float]] = deque(maxlen=WINDOW)
         #: Totals of the run's faults: worlds that diverged, updates that were skipped.
         self.faults = dict.fromkeys(FAULTS, 0.0)
+        self._judged: dict[str, float] = {}
         self.started = time.monotonic()
         self._last_line = -math.inf
         self._enabled = enabled
@@ -73,6 +76,7 @@ class Progress:
         self.recent.append(row)
         for name in FAULTS:
             self.faults[name] += row.get(name, 0.0)
+        self._judged |= {name: row[name] for name in JUDGED if name in row}
         if not self._enabled:
             return
         fraction, left = self._remaining(row["samples"])
@@ -110,9 +114,17 @@ class Progress:
             f"{self.mean('samples_per_s'):,.0f}/s",
             f"{clock(left)} left",
             *rate_texts(self.rates()),
+            *self.judged_texts(),
             *self.fault_texts(),
         ]
         return " | ".join(parts)
+
+    def judged_texts(self) -> list[str]:
+        """The last judgement in words; nothing without one."""
+        words = ", ".join(
+            text.format(100.0 * self._judged[name]) for name, text in JUDGED.items() if name in self._judged
+        )
+        return [words] if words else []
 
     def fault_texts(self) -> list[str]:
         """The run's faults in words; nothing without one."""
