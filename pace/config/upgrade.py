@@ -210,6 +210,7 @@ def stamp_the_base(state: Saved) -> None:
         over, delay = env["game.ends.over"], env["sensing._delay"]
         env["sensing.base_age"] = env.pop("sensing.mocap._base_age", 0.02 * delay)
         env["sensing.base_new"] = over.new_ones(over.shape)
+        env["sensing._slow"] = delay.new_zeros(len(delay), 6)
 
 
 def remember_a_good_serve(state: Saved) -> None:

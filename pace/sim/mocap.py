@@ -117,7 +117,7 @@ def _capture(
 
 
 @wp.func
-def _drift(cameras: Cameras, slow: wp.array[wp.float32], kept: float, seed: int, number: int):
+def drift(cameras: Cameras, slow: wp.array[wp.float32], kept: float, seed: int, number: int):
     """The slow noise one frame later; with ``kept`` 0 from scratch."""
     for column in range(6):
         random = wp.rand_init(seed, SEQUENCES * number + VALUES + column)
@@ -181,7 +181,7 @@ def _begin(
     world = wp.tid()
     if not mask[world]:
         return
-    _drift(cameras, film.slow[world], 0.0, seed[world], 0)
+    drift(cameras, film.slow[world], 0.0, seed[world], 0)
     for column in range(TRUTH):
         film.truth[world, 0, column] = _truth(robot, ball_position, world, column)
     for slot in range(film.ring.shape[1]):
@@ -225,7 +225,7 @@ def _advance(
     while time <= control_dt:
         number += 1
         frame = ring[_oldest(ring)]
-        _drift(cameras, slow, cameras.kept, seed[world], number)
+        drift(cameras, slow, cameras.kept, seed[world], number)
         share = time / control_dt
         noise = film.scale[world]
         _capture(cameras, truth, share, mask[world], noise, film.amplitude, slow, frame, seed[world], number)
@@ -291,8 +291,8 @@ class Mocap(Stateful):
 
 
 def cameras_of(config: MocapConfig, control_dt: float) -> dict[str, float | list[float]]:
-    """The fields of :class:`Cameras`; ``control_dt`` in s."""
-    period = 1.0 / config.rate
+    """The fields of :class:`Cameras`; ``control_dt`` in s, between frames without a rate of their own."""
+    period = 1.0 / config.rate if config.rate > 0.0 else control_dt
     return {
         "control_dt": control_dt,
         "period": period,

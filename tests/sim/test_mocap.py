@@ -93,6 +93,8 @@ def test_the_delay_of_frames_jitters_in_its_range(part: str) -> None:
     assert 0.048 < float(found.max()) <= 0.004 + 0.026 + DT + 1e-5
     assert float(found.mean()) == pytest.approx(0.004 + 0.013 + DT / 2, abs=3e-4)
     assert float(found.std()) == pytest.approx(math.sqrt((0.026**2 + DT**2) / 12), rel=0.02)
+    per_world = torch.stack([filmed.age[filmed.new[:, w], w].std() for w in range(WORLDS)])  # of 200 frames
+    assert per_world.tolist() == pytest.approx([math.sqrt((0.026**2 + DT**2) / 12)] * WORLDS, rel=0.25)
 
 
 @pytest.mark.parametrize("part", ["ball", "base"])
@@ -133,13 +135,60 @@ def test_frames_are_lost_in_runs(part: str) -> None:
     filmed = Filmed(part=part, gap_rate=0.5, gap=[0.05, 0.1]).run()
     between = filmed.between()
     runs = between[between > 0.03]
-    assert len(runs) / (WORLDS * STEPS * DT) == pytest.approx(0.5 / (1.0 + 0.5 * 0.075), rel=0.06)
+    rate = 0.5 / (1.0 + 0.5 * 0.075)  # 1/s, of runs: a Poisson process between them
+    assert len(runs) / (WORLDS * STEPS * DT) == pytest.approx(rate, rel=0.06)
+    late = ((filmed.stamp[5:] - filmed.stamp[4:-1] > 0.03) & filmed.new[5:]).float().sum(0)  # runs of each world
+    mean = rate * (STEPS - 5) * DT
+    assert float(late.mean()) == pytest.approx(mean, rel=0.06)
+    assert float(late.var()) == pytest.approx(mean, rel=0.3)
     # the frame that began the run, those within it, and up to two that a newer one replaced within the control step
     assert 0.05 < float(runs.min()) < 0.06
     single = runs < 0.1 + 4 * PERIOD  # else the next run began at once
     assert float(single.float().mean()) > 0.97
     assert float(runs[single].max()) > 0.11
     assert float(runs[single].mean()) == pytest.approx(0.075 + 2.5 * PERIOD, abs=0.002)
+
+
+@pytest.mark.parametrize("part", ["ball", "base"])
+def test_one_frame_a_control_step_may_be_lost(part: str) -> None:
+    filmed = Filmed(part=part, rate=0.0, lost=0.2).run()
+    assert float(filmed.error.abs().max()) < 1e-4  # what is held has its own age
+    came = filmed.new.float().mean(0)
+    assert float(came.mean()) == pytest.approx(0.8, abs=0.005)
+    assert float(came.std()) == pytest.approx(math.sqrt(0.2 * 0.8 / STEPS), rel=0.2)  # of the worlds
+    waited = ((filmed.age - 0.004) / DT).round()
+    assert float((filmed.age - 0.004 - waited * DT).abs().max()) < 1e-4
+    assert float((waited[5:] == 2).float().mean()) == pytest.approx(0.8 * 0.2**2, abs=0.004)
+    assert bool(((waited == 0) == filmed.new).all())
+
+
+@pytest.mark.parametrize("part", ["ball", "base"])
+def test_the_delay_of_one_frame_a_control_step_jitters(part: str) -> None:
+    filmed = Filmed(part=part, rate=0.0, jitter=[0.0, 0.016]).run()
+    assert float(filmed.error.abs().max()) < 1e-4
+    assert bool(filmed.new.all())
+    assert 0.004 <= float(filmed.age.min()) < 0.0045
+    assert 0.0195 < float(filmed.age.max()) <= 0.02 + 1e-6
+    assert filmed.age.mean(0).tolist() == pytest.approx([0.012] * WORLDS, abs=0.001)
+    assert filmed.age.std(0).tolist() == pytest.approx([0.016 / math.sqrt(12)] * WORLDS, rel=0.15)
+    # by more than a step: a frame that is older than the one before comes to nothing
+    filmed = Filmed(part=part, rate=0.0, jitter=[0.0, 0.026]).run()
+    assert float((filmed.stamp[1:] - filmed.stamp[:-1]).min()) > -1e-6
+    assert float(filmed.new.float().mean()) == pytest.approx(1.0 - (0.026 - DT) ** 2 / (2 * 0.026**2), abs=0.004)
+
+
+@pytest.mark.parametrize("part", ["ball", "base"])
+def test_one_frame_a_control_step_has_white_and_slow_noise(part: str) -> None:
+    error = Filmed(part=part, rate=0.0, slow_noise=0.0052, slow_noise_time=0.06).run().error
+    assert float(error.std()) == pytest.approx(0.0052, rel=0.02)
+    assert float(error.std(0).mean(1).min()) > 0.004
+    for lag in (1, 3, 10):
+        same = float((error[lag:] * error[:-lag]).mean() / error.square().mean())
+        assert same == pytest.approx(math.exp(-DT * lag / 0.06), abs=0.02)
+    assert error[0].std() == pytest.approx(0.0052, rel=0.1)
+    white = Filmed(part=part, rate=0.0, white_noise=0.0019).run().error
+    assert float(white.std()) == pytest.approx(0.0019, rel=0.01)
+    assert float((white[1:] * white[:-1]).mean()) / 0.0019**2 == pytest.approx(0.0, abs=0.01)
 
 
 def test_the_ball_is_hidden_around_the_strike() -> None:
@@ -196,8 +245,9 @@ def test_worlds_are_independent() -> None:
     assert float(worlds.abs().max()) < 0.6  # of 20,000 pairs with about 83 independent times each
 
 
-def test_its_state_resumes_exactly() -> None:
-    numbers = config("sensing=mocap").sensing.mocap
+@pytest.mark.parametrize("given", ["sensing=mocap", "sensing.mocap.lost=0.2"])
+def test_its_state_resumes_exactly(given: str) -> None:
+    numbers = replace(config(given).sensing.mocap, slow_noise=0.005)
     one, other = (Filmed(**vars(numbers)) for _ in range(2))
     one.run(20)
     other.sensing.load_state_dict(one.sensing.state_dict())
@@ -219,6 +269,7 @@ def test_its_state_resumes_exactly() -> None:
         ({"slow_noise_time": 0.0}, "slow_noise_time must be positive"),
         ({"jitter": [0.02, 0.01]}, "jitter: low 0.02 is above high"),
         ({"gap": [0.0, math.inf]}, "gap must be finite"),
+        ({"occlusion": 0.2}, "occlusion needs sensing.mocap.rate"),
     ],
 )
 def test_bad_numbers_are_refused(change: dict[str, Any], words: str) -> None:
