@@ -27,6 +27,7 @@ from pace.runs.metrics import read_metrics
 from pace.runs.run_folder import RunFolder
 from tests.helpers.algo import IN_SAMPLES
 from tests.helpers.dummy import DummyTask
+from tests.helpers.training import assert_same, dummy_trainer
 
 WORLDS = 64
 UPDATE = WORLDS * 12
@@ -307,3 +308,36 @@ def test_a_run_folder_has_one_owner(tmp_path: Path) -> None:
     first.close()
     assert read_metrics(tmp_path / "metrics.csv")["update"] == [1.0, 2.0]  # the second has touched nothing
     RunFolder(tmp_path, {}, False, 2).close()
+
+
+class Watching:
+    """A judge that gives numbers of its own."""
+
+    def __init__(self) -> None:
+        self.seen: list[Path] = []
+
+    def quick(self, checkpoint: Path, minutes: float) -> dict[str, float]:
+        """Random numbers of its own would be another judge's business: this one takes none."""
+        assert minutes >= 0.0
+        assert (checkpoint / "weights.safetensors").exists()
+        self.seen.append(checkpoint)
+        return {"eval_hit": 0.25 * len(self.seen), "eval_success": 0.5}
+
+    def last(self, run: Path, minutes: float) -> None:
+        """Whoever made the trainer asks for it."""
+        raise AssertionError(f"{run} after {minutes}")
+
+
+def test_a_judgement_follows_each_checkpoint_and_is_in_the_next_row(tmp_path: Path) -> None:
+    judged = dummy_trainer(tmp_path / "judged", 4)
+    judged.judge = judge = Watching()
+    judged.train()
+    dummy_trainer(tmp_path / "alone", 4).train()
+    assert len(judge.seen) == 3  # the last checkpoint is left to the judgement at the end
+    found = read_metrics(tmp_path / "judged" / "metrics.csv")
+    assert found["eval_hit"][1:] == [0.25, 0.5, 0.75]
+    assert math.isnan(found["eval_hit"][0])
+    assert all(map(math.isnan, read_metrics(tmp_path / "alone" / "metrics.csv")["eval_success"]))
+    one, other = load_checkpoint(tmp_path / "judged"), load_checkpoint(tmp_path / "alone")
+    assert_same(one.weights, other.weights)
+    assert_same(one.training, other.training)
