@@ -24,6 +24,7 @@ from pace.rl.trainer import Trainer
 from pace.runs.checkpoint import CheckpointError, load_checkpoint
 from pace.runs.checkpoint_folders import list_checkpoints
 from pace.runs.metrics import read_metrics
+from pace.runs.optimiser import learning_rate
 from pace.runs.run_folder import RunFolder
 from tests.helpers.algo import IN_SAMPLES
 from tests.helpers.dummy import DummyTask
@@ -308,6 +309,18 @@ def test_a_run_folder_has_one_owner(tmp_path: Path) -> None:
     first.close()
     assert read_metrics(tmp_path / "metrics.csv")["update"] == [1.0, 2.0]  # the second has touched nothing
     RunFolder(tmp_path, {}, False, 2).close()
+
+
+def test_a_run_that_starts_from_weights_begins_with_steps_that_their_std_allows(tmp_path: Path) -> None:
+    """Adam's first steps are as large as the learning rate, and at a tenth of the std their KL a hundred times."""
+    for std, rate in ((0.1, 1e-5), (0.5, 2.5e-4), (1.0, 1e-3)):
+        old, new = (dummy_trainer(tmp_path / f"{part}_{std}", 3) for part in ("old", "new"))
+        learner(old).agent.actor.bound_std(0.05, std)
+        new.start_from(old.checkpoint())
+        assert learning_rate(learner(new).ppo.actor_optimiser).item() == pytest.approx(rate)
+        assert learning_rate(learner(new).ppo.critic_optimiser).item() == pytest.approx(1e-3)
+        said = f"the actor's learning rate at {rate:.2g} first, as a std of {std:.2g} allows"
+        assert (said in learner(new).describe()) == (std < 1.0)
 
 
 class Watching:
