@@ -20,8 +20,9 @@ RATES = {  # column: label, factor, digits, unit
     "fall_rate": ("falls", 1.0, 3, "/s"),
     "predictor_rmse_cm": ("predictor", 1.0, 1, " cm"),
 }
-#: Columns of a judgement without exploration, in words.
-JUDGED = {"eval_hit": "judged: hit {:.0f}", "eval_success": "return {:.0f} %"}
+FIRST = ("hit_rate", "success_rate")  # of the rates
+#: Columns of a judgement without exploration: hits and returns.
+JUDGED = ("eval_hit", "eval_success")
 #: Column of a fault -> its total in words.
 FAULTS = {"diverged": "{} worlds diverged", "skipped": "{} updates skipped"}
 WINDOW = 25  # updates over which the shown rates are taken
@@ -108,23 +109,25 @@ class Progress:
         return done, left
 
     def _describe(self, row: dict[str, float], left: float) -> str:
-        parts = [
-            f"update {row['update']:.0f}",
-            f"{row['samples'] / 1e6:.2f} M samples",
-            f"{self.mean('samples_per_s'):,.0f}/s",
+        first, rest = {}, {}
+        for name, rate in self.rates().items():
+            (first if name in FIRST else rest)[name] = rate
+        parts = [  # what matters most comes first: a terminal of 80 columns cuts the line
             f"{clock(left)} left",
-            *rate_texts(self.rates()),
+            *rate_texts(first),
             *self.judged_texts(),
             *self.fault_texts(),
+            f"{row['samples'] / 1e6:.2f} M samples",
+            f"{self.mean('samples_per_s'):,.0f}/s",
+            *rate_texts(rest),
+            f"update {row['update']:.0f}",
         ]
         return " | ".join(parts)
 
     def judged_texts(self) -> list[str]:
         """The last judgement in words; nothing without one."""
-        words = ", ".join(
-            text.format(100.0 * self._judged[name]) for name, text in JUDGED.items() if name in self._judged
-        )
-        return [words] if words else []
+        shares = [f"{100.0 * self._judged[name]:.0f}" for name in JUDGED if name in self._judged]
+        return [f"judged {'/'.join(shares)} %"] if shares else []
 
     def fault_texts(self) -> list[str]:
         """The run's faults in words; nothing without one."""
