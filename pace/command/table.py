@@ -13,8 +13,8 @@ TRAIN_GROUPS = (
 )  # fmt: skip
 CHECKPOINT_ERROR = "pace.runs.checkpoint:CheckpointError"
 SAVED_RUN = (
-    "RUN is a run folder, a checkpoint in one, or the name of a published policy (campaign). The task is the one saved with the "
-    "policy; change it as in training, by a choice of a group (ball=paper) or a value (engine.solver_iterations=20)."
+    "RUN is a run folder, a checkpoint in one, or the name of a published policy (campaign). The task is the one saved "
+    "with the policy; change it as in training, by a choice of a group (ball=paper) or a value (engine.solver_iterations=20)."
 )
 
 
@@ -114,7 +114,8 @@ COMMANDS = {
         config="export",
         summary="a policy as one ONNX file for the robot, checked against torch",
         usage="RUN [key=value ...]",
-        about="RUN is a run folder, a checkpoint in one, or the name of a published policy (campaign). Writes policy.onnx into the folder out.",
+        about="RUN is a run folder, a checkpoint in one, or the name of a published policy (campaign). Writes "
+        "policy.onnx into the folder out.",
         examples=("pretrained/pace", "runs/2026-01-01_pace out=runs/robot"),
         positional=("run",),
     ),
