@@ -38,7 +38,7 @@ def resolve_device(device: str | torch.device) -> torch.device:
         return torch.device("cpu")
     seen, index = seen_by_torch(), resolved.index or 0
     if str(device) == "auto" and seen.count == 0:
-        if has_driver() and not os.environ.get(VISIBLE) == "":
+        if has_driver() and os.environ.get(VISIBLE) != "":
             _say(f"warning: device=auto is the CPU, though a GPU's driver is here: {why_not_seen(seen)}")
         return torch.device("cpu")
     if index >= seen.count:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from typing import Any
 
 import pytest
@@ -109,6 +110,27 @@ def test_replayed_steps_and_resets_equal_those_without_a_graph(monkeypatch: pyte
     assert statistics == same
     assert min(statistics["episodes"], statistics["serves"]) > 0
     assert statistics["steps"] == N * (STEPS + 5)
+
+
+@pytest.mark.parametrize("graphs", ["auto", "dry"])
+def test_a_second_environment_leaves_the_first_one_as_it_is(graphs: str) -> None:
+    """As in a notebook: another is made, played and freed while the first one goes on."""
+
+    def played(beside: bool) -> list[dict[str, Any]]:
+        env = make("cpu", f"engine.graph={graphs}")
+        states = play(env, 4)
+        if beside:
+            other = make("cpu", f"engine.graph={graphs}", "robot.action_scale=0.3")
+            play(other, 4)
+            states += play(env, 2)
+            del other
+            gc.collect()
+            return states + play(env, 2)
+        return states + play(env, 2) + play(env, 2)
+
+    for state, same in zip(played(True), played(False), strict=True):
+        for name, value in same.items():
+            torch.testing.assert_close(state[name], value, rtol=0, atol=0, equal_nan=True)
 
 
 def test_graphs_need_a_gpu() -> None:

@@ -290,8 +290,8 @@ def test_a_full_gpu_is_one_line_and_other_errors_stay(
     monkeypatch.setattr(sys, "argv", ["validate"])
     assert run_command("validate") == 1
     assert capsys.readouterr().err == (
-        "error: the GPU's memory is full (8.0 GiB, 0.5 free): by estimate a training run of 8,704 worlds fits if nothing "
-        "else runs there; give a smaller num_worlds\n"
+        "error: the GPU's memory is full (8.0 GiB, 0.5 free): by estimate a training run of 8,704 worlds fits if "
+        "nothing else runs there; give a smaller num_worlds\n"
     )
     error = RuntimeError("another")
     with pytest.raises(RuntimeError, match="another"):
