@@ -19,7 +19,7 @@ import pytest
 import torch
 
 from pace.runs.run_folder import git_state
-from tests.gpu.measure import CPU, GPU, Sizes
+from tests.helpers.gpu import CPU, GPU, Sizes
 
 DEVICE = os.environ.get("PACE_GPU_TESTS_DEVICE", "cuda:0")
 PACKAGES = ("torch", "torchrl", "warp-lang", "mujoco-warp", "mujoco")

@@ -23,7 +23,7 @@ from pace.runs.checkpoint import load_checkpoint
 from pace.runs.metrics import markdown
 from pace.viewer.__main__ import main as play
 from pace.viewer.playback import Show
-from tests.gpu.measure import NETWORK
+from tests.helpers.gpu import NETWORK
 from tests.helpers.outside import command
 from tests.helpers.saved import save_run
 

@@ -24,7 +24,7 @@ from pace.config.commands import BenchConfig
 from pace.runs.checkpoint_folders import list_checkpoints
 from pace.runs.metrics import markdown, read_metrics
 from pace.studies import parity
-from tests.gpu.measure import Sizes, captured, curve, difference_table, environment, loop_of, play
+from tests.helpers.gpu import Sizes, captured, curve, difference_table, environment, loop_of, play
 
 pytestmark = pytest.mark.gpu
 ROOT = Path(__file__).parents[2]
@@ -33,10 +33,20 @@ Page = Callable[[str, str], None]
 PLAIN = ("progress=false", "first_ball=[]", "task=own", "physics_dt=0.01")
 
 
-def python(module: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """``python -m module``. Errors: what it said, if it failed."""
-    line = [sys.executable, "-m", module, *arguments]
+#: Chooses Warp's guarantee, before its modules are made, and plays two environments of one seed.
+TWO_RUNS = """
+import warp as wp
+wp.config.deterministic = wp.DeterministicMode.{mode}
+import torch
+from tests.helpers.gpu import two_runs
+two_runs(torch.device("{device}"), {worlds}, {marks})
+"""
+
+
+def python(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """``python ARGUMENTS``. Errors: what it said, if it failed."""
     given = os.environ | {"PYTHONPATH": str(ROOT)}
+    line = [sys.executable, *arguments]
     done = subprocess.run(line, env=given, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise AssertionError(f"{' '.join(line)}: {done.returncode}\n{done.stdout[-2000:]}\n{done.stderr[-4000:]}")
@@ -75,8 +85,9 @@ def test_two_runs_of_one_seed(device: torch.device, sizes: Sizes, page: Page, mo
     if mode != "NOT_GUARANTEED" and device.type != "cuda":
         pytest.skip("a CPU has a fixed order")
     title = f"Two runs of one seed, warp.config.deterministic {mode}"
+    code = TWO_RUNS.format(mode=mode, device=device, worlds=sizes.worlds, marks=sizes.marks)
     try:
-        done = python("tests.gpu.seeds", mode, str(device), str(sizes.worlds), ",".join(map(str, sizes.marks)))
+        done = python("-c", code)
     except AssertionError as error:
         if mode == "NOT_GUARANTEED":
             raise
@@ -109,7 +120,9 @@ def test_killed_and_resumed(device: torch.device, sizes: Sizes, page: Page, tmp_
     before = read_metrics(run / "metrics.csv")
     per_update = before["samples"][0]
     target = before["samples"][-1] + 20 * per_update
-    resumed = python("pace.rl.train", f"resume={run}", f"samples={target:.0f}", "progress=false", f"device={device}")
+    resumed = python(
+        "-m", "pace.rl.train", f"resume={run}", f"samples={target:.0f}", "progress=false", f"device={device}"
+    )
     after = read_metrics(run / "metrics.csv")
     assert [int(update) for update in after["update"]] == list(range(1, len(after["update"]) + 1))
     assert all(math.isfinite(value) for value in after["kl"])
@@ -147,7 +160,9 @@ def test_a_minute_of_training_and_its_evaluation(
     """``PACE_GPU_RUN='minutes=10 experiment=generalist'`` is another run."""
     run, overrides = tmp_path / "run", os.environ.get("PACE_GPU_RUN", "").split() or sizes.run
     started = time.perf_counter()
-    done = python("pace.rl.train", f"out={run}", f"device={device}", "progress=false", "tensorboard=false", *overrides)
+    done = python(
+        "-m", "pace.rl.train", f"out={run}", f"device={device}", "progress=false", "tensorboard=false", *overrides
+    )
     took = time.perf_counter() - started
     said = [line for line in done.stdout.splitlines() if line.startswith(("for this", "compil", "planned"))]
     rows = curve(read_metrics(run / "metrics.csv"))
@@ -155,7 +170,7 @@ def test_a_minute_of_training_and_its_evaluation(
     page("Learning", f"{text}\n\n{rows}")
     started = time.perf_counter()
     done = python(
-        "pace.evaluation", str(run), f"device={device}", f"out={tmp_path / 'table'}", *PLAIN, *sizes.evaluated
+        "-m", "pace", "evaluate", str(run), f"device={device}", f"out={tmp_path / 'table'}", *PLAIN, *sizes.evaluated
     )
     took = time.perf_counter() - started
     table = [line for line in done.stdout.splitlines() if line and not line.startswith("wrote")]

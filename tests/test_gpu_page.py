@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[1]
 SECTIONS = (
     "Parity of the engines", "Graphs against calls", "Two runs of one seed", "Killed and resumed",
     "Speed and memory by worlds", "An update of the paper's networks beside rsl_rl's", "Learning", "Its evaluation",

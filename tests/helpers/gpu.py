@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from torch import Tensor
 from pace.config.training import TrainConfig, load_train_config
 from pace.predictor.network import make_predictor
 from pace.predictor.priors import resolve_priors
+from pace.rl.kernels import warm
 from pace.rl.trainer import Trainer
 from pace.runs.metrics import markdown
 from pace.task.env import TableTennisEnv
@@ -138,6 +140,22 @@ def difference_table(worlds: int, one: dict[int, Tensor], other: dict[int, Tenso
         f"equal to the bit, of {worlds}",
     ]
     return markdown(head, apart(one, other))
+
+
+def two_runs(device: torch.device, worlds: int, marks: Sequence[int]) -> None:
+    """Print, as one line of JSON, how far two environments of one seed are apart, ms a step, and what each counted."""
+    graph = captured(device)
+    warm(config_of(device, worlds, graph), device)
+    (one, _, counted), (other, ms, again) = (_played(device, worlds, graph, marks) for _ in range(2))
+    counts = [{key: float(run[key]) for key in ("serves", "hits", "falls")} for run in (counted, again)]
+    print(json.dumps({"rows": apart(one, other), "ms": ms, "counts": counts}))
+
+
+def _played(
+    device: torch.device, worlds: int, graph: str, marks: Sequence[int]
+) -> tuple[dict[int, Tensor], float, dict[str, Tensor]]:
+    env = environment(device, worlds, graph)
+    return *play(env, marks), env.pop_statistics()
 
 
 def loop_of(device: torch.device, worlds: int, sizes: Sizes) -> list[str]:
