@@ -5,7 +5,6 @@ A failed test leaves its section out, and the others go on.
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import signal
@@ -24,23 +23,13 @@ from pace.config.commands import BenchConfig
 from pace.runs.checkpoint_folders import list_checkpoints
 from pace.runs.metrics import markdown, read_metrics
 from pace.studies import parity
-from tests.helpers.gpu import Sizes, captured, curve, difference_table, environment, loop_of, play
+from tests.helpers.gpu import Sizes, captured, curve, difference_table, environment, loop_of, play, two_runs
 
 pytestmark = pytest.mark.gpu
 ROOT = Path(__file__).parents[2]
 Page = Callable[[str, str], None]
 #: Of an evaluation: what the page does not show.
 PLAIN = ("progress=false", "first_ball=[]", "task=own", "physics_dt=0.01")
-
-
-#: Chooses Warp's guarantee, before its modules are made, and plays two environments of one seed.
-TWO_RUNS = """
-import warp as wp
-wp.config.deterministic = wp.DeterministicMode.{mode}
-import torch
-from tests.helpers.gpu import two_runs
-two_runs(torch.device("{device}"), {worlds}, {marks})
-"""
 
 
 def python(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -79,30 +68,11 @@ def test_graphs_and_calls(device: torch.device, sizes: Sizes, page: Page) -> Non
     assert float((calls[first] - graphs[first])[:, 7:].abs().median()) < 1e-4
 
 
-@pytest.mark.parametrize("mode", ["NOT_GUARANTEED", "RUN_TO_RUN"])
-def test_two_runs_of_one_seed(device: torch.device, sizes: Sizes, page: Page, mode: str) -> None:
-    """With Warp's guarantee everything compiles again; if that fails, the page says how."""
-    if mode != "NOT_GUARANTEED" and device.type != "cuda":
-        pytest.skip("a CPU has a fixed order")
-    title = f"Two runs of one seed, warp.config.deterministic {mode}"
-    code = TWO_RUNS.format(mode=mode, device=device, worlds=sizes.worlds, marks=sizes.marks)
-    try:
-        done = python("-c", code)
-    except AssertionError as error:
-        if mode == "NOT_GUARANTEED":
-            raise
-        page(title, "It fails: " + str(error).strip().splitlines()[-1])
-        return
-    found = json.loads(done.stdout.splitlines()[-1])
-    head = [
-        "control steps",
-        "worst joint (mrad), median",
-        "largest",
-        "worlds within 1 mrad",
-        f"equal, of {sizes.worlds}",
-    ]
-    counts = "; ".join(", ".join(f"{name} {value:,.0f}" for name, value in run.items()) for run in found["counts"])
-    page(title, f"A step takes {found['ms']:.2f} ms. The two runs: {counts}.\n\n{markdown(head, found['rows'])}")
+@pytest.mark.parametrize("fixed_order", [False, True])
+def test_two_runs_of_one_seed(device: torch.device, sizes: Sizes, page: Page, fixed_order: bool) -> None:
+    """``engine.deterministic`` is MuJoCo Warp's own switch; its kernels are others, and compile once more."""
+    text, _ = two_runs(device, sizes.worlds, sizes.marks, fixed_order)
+    page(f"Two runs of one seed, engine.deterministic={str(fixed_order).lower()}", text)
 
 
 def test_killed_and_resumed(device: torch.device, sizes: Sizes, page: Page, tmp_path: Path) -> None:

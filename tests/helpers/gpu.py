@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -95,8 +94,8 @@ def config_of(device: torch.device, worlds: int, graph: str, overrides: Sequence
     return config
 
 
-def environment(device: torch.device, worlds: int, graph: str) -> TableTennisEnv:
-    config = config_of(device, worlds, graph)
+def environment(device: torch.device, worlds: int, graph: str, overrides: Sequence[str] = ()) -> TableTennisEnv:
+    config = config_of(device, worlds, graph, overrides)
     torch.manual_seed(config.seed)
     return TableTennisEnv(config, worlds, device, config.seed, make_predictor(config.predictor).to(device))
 
@@ -142,20 +141,19 @@ def difference_table(worlds: int, one: dict[int, Tensor], other: dict[int, Tenso
     return markdown(head, apart(one, other))
 
 
-def two_runs(device: torch.device, worlds: int, marks: Sequence[int]) -> None:
-    """Print, as one line of JSON, how far two environments of one seed are apart, ms a step, and what each counted."""
-    graph = captured(device)
-    warm(config_of(device, worlds, graph), device)
-    (one, _, counted), (other, ms, again) = (_played(device, worlds, graph, marks) for _ in range(2))
-    counts = [{key: float(run[key]) for key in ("serves", "hits", "falls")} for run in (counted, again)]
-    print(json.dumps({"rows": apart(one, other), "ms": ms, "counts": counts}))
-
-
-def _played(
-    device: torch.device, worlds: int, graph: str, marks: Sequence[int]
-) -> tuple[dict[int, Tensor], float, dict[str, Tensor]]:
-    env = environment(device, worlds, graph)
-    return *play(env, marks), env.pop_statistics()
+def two_runs(device: torch.device, worlds: int, marks: Sequence[int], fixed_order: bool) -> tuple[str, float]:
+    """How far two environments of one seed come apart, in words; and ms a step."""
+    given = [f"engine.deterministic={str(fixed_order).lower()}"]
+    warm(config_of(device, worlds, captured(device), given), device)
+    played = []
+    for _ in range(2):
+        env = environment(device, worlds, captured(device), given)
+        played.append((*play(env, marks), env.pop_statistics()))
+    counts = ("; ".join(f"{float(run[name]):,.0f}" for *_, run in played) for name in ("serves", "hits", "falls"))
+    counted = ", ".join(f"{name} {both}" for name, both in zip(("serves", "hits", "falls"), counts, strict=True))
+    (one, _, _), (other, ms, _) = played
+    text = f"A step of {worlds:,} worlds takes {ms:.2f} ms. The two runs counted: {counted}."
+    return f"{text}\n\n{difference_table(worlds, one, other)}", ms
 
 
 def loop_of(device: torch.device, worlds: int, sizes: Sizes) -> list[str]:
