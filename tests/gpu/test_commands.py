@@ -58,6 +58,9 @@ def test_train_and_resume(tmp_path: Path, page: Page) -> None:
     assert command(train, *given, f"out={out}", "samples=128") == 0
     assert command(train, f"resume={out}", "samples=256", "progress=false") == 0
     assert load_checkpoint(out).counters["samples"] == 256
+    policy = load_policy(out)  # on a CPU, wherever it was trained
+    env = policy.make_env(2, "cpu", overrides=["engine=native"])
+    assert policy.act(env.policy_observation).isfinite().all()
     done_in(page, "`pace train`", started)
 
 
