@@ -139,14 +139,22 @@ class CapturedCall:
             with _generators_kept(self._device, self._generator):
                 return CudaGraph(self._function, inputs, self._device, self._generator)
         except RuntimeError as error:
-            if out_of_memory(error):
+            first = _first(error)
+            if out_of_memory(first):
                 raise
-            fault = f"{_name(self._function)} cannot be captured: {str(error).strip().splitlines()[0]}"
+            fault = f"{_name(self._function)} cannot be captured: {str(first).strip().splitlines()[0]}"
             if self._graphs is Graphs.CUDA:
                 raise RuntimeError(f"no CUDA graph, {fault}; engine.graph=never runs without graphs") from error
             _say_without_graphs(fault)
             self._graphs = Graphs.NONE
             return None
+
+
+def _first(error: BaseException) -> BaseException:
+    """What went wrong in a capture: its end fails then too, with an error that hides the first one."""
+    while isinstance(error.__context__, RuntimeError):
+        error = error.__context__
+    return error
 
 
 def _name(function: Any) -> str:

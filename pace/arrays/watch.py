@@ -109,16 +109,12 @@ def loads_refused() -> Iterator[None]:
 
         return launching
 
-    def checked(module: Any, *args: Any, **kwargs: Any) -> Any:
-        known = list(module.execs.values())
-        try:
-            found, cause = load(module, *args, **kwargs), None
-        except RuntimeError as error:
-            found, cause = None, error
-        if found is None or not any(found is each for each in known):
+    def checked(module: Any, device: Any, block_dim: int | None = None, *args: Any, **kwargs: Any) -> Any:
+        known = module.execs.get((wp.get_device(device).context, block_dim or module.options["block_dim"]))
+        found = None if known is None else load(module, device, block_dim, *args, **kwargs)
+        if found is None or found is not known:
             where = f"{place()}: kernel '{launched[0]}' is used for the first time, or was unloaded"
-            text = f"{where}: Warp's module {module.name} is loaded in a call that a graph would hold"
-            raise DryRunError(text) from cause
+            raise DryRunError(f"{where}: Warp's module {module.name} is loaded in a call that a graph would hold")
         return found
 
     launches = [(owner, "launch", named(owner.launch)) for owner in (wp, context)]

@@ -196,7 +196,10 @@ class Uncapturable:
     def __init__(self, function: Any, inputs: Any, device: Any, generator: torch.Generator) -> None:
         torch.rand(3)
         torch.rand(3, generator=generator)
-        raise RuntimeError(f"{self.reason}\nCUDA kernel errors might be asynchronously reported")
+        try:
+            raise RuntimeError(f"{self.reason}\nCUDA kernel errors might be asynchronously reported")
+        finally:
+            raise RuntimeError("CUDA error: the capture was ended before")  # what its end says, behind the first error
 
 
 def drawing(total: Tensor, generator: torch.Generator) -> Any:
