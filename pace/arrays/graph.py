@@ -58,12 +58,15 @@ def graphs_of(engine: EngineConfig, device: torch.device) -> Graphs:
     return Graphs.CUDA if engine.graph == "always" else Graphs.TRY
 
 
-@cache
-def _say_without_graphs(reason: str) -> None:
-    """One line for each reason."""
-    print(
-        f"warning: no CUDA graphs, so it is slower ({reason}); engine.graph=always makes it an error", file=sys.stderr
-    )
+_SAID: set[str] = set()  # reasons
+
+
+def _say_without_graphs(reason: str, what: str = "") -> None:
+    """One line for each reason, with the first call that it stopped."""
+    if reason not in _SAID:
+        _SAID.add(reason)
+        text = f"warning: no CUDA graphs, so it is slower ({what}{reason}); engine.graph=always makes it an error"
+        print(text, file=sys.stderr)
 
 
 class CapturedCall:
@@ -142,10 +145,10 @@ class CapturedCall:
             first = _first(error)
             if out_of_memory(first):
                 raise
-            fault = f"{_name(self._function)} cannot be captured: {str(first).strip().splitlines()[0]}"
+            what, reason = f"{_name(self._function)} cannot be captured: ", str(first).strip().splitlines()[0]
             if self._graphs is Graphs.CUDA:
-                raise RuntimeError(f"no CUDA graph, {fault}; engine.graph=never runs without graphs") from error
-            _say_without_graphs(fault)
+                raise RuntimeError(f"no CUDA graph, {what}{reason}; engine.graph=never runs without graphs") from error
+            _say_without_graphs(reason, what)
             self._graphs = Graphs.NONE
             return None
 

@@ -222,7 +222,7 @@ def test_without_a_capture_it_goes_on_as_before_and_says_so_once(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(graph, "CudaGraph", Uncapturable)
-    graph._say_without_graphs.cache_clear()
+    graph._SAID.clear()
     expected = drawn(Graphs.NONE)
     assert capsys.readouterr().err == ""
     for _ in range(2):
@@ -266,7 +266,7 @@ def test_a_full_memory_is_no_reason_to_go_on_without(monkeypatch: pytest.MonkeyP
 
 def test_a_gpu_without_a_memory_pool(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(graph, "memory_pool_is_off", lambda _: True)
-    graph._say_without_graphs.cache_clear()
+    graph._SAID.clear()
     gpu = torch.device("cuda:0")
     for _ in range(2):
         assert graphs_of(config().engine, gpu) is Graphs.NONE

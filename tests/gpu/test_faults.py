@@ -29,7 +29,7 @@ ROOT = Path(__file__).parents[2]
 def gpu(device: torch.device) -> torch.device:
     if device.type != "cuda":
         pytest.skip("needs a GPU")
-    graph._say_without_graphs.cache_clear()
+    graph._SAID.clear()
     return device
 
 
