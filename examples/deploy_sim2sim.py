@@ -28,7 +28,7 @@ import onnxruntime
 import onnxruntime.capi.onnxruntime_pybind11_state as ort  # type: ignore[import-not-found]
 
 SCENE = Path(__file__).resolve().parent.parent / "pace" / "sim" / "assets" / "scene.xml"
-FORMAT = 4  # of the metadata that is understood here
+FORMAT = 5  # of the metadata that is understood here
 GRAVITY = np.array([0.0, 0.0, -9.81])  # m/s^2
 PHYSICS_DT = 0.002  # s
 BALL_DT = 0.001  # s: a ball at 10 m/s moves by half its radius
@@ -382,7 +382,8 @@ class Robot:
         amplitude = {name: self.noise * self.meta["sensing"][name] for name in truth}
         seen = {n: v + amplitude[n] * self._random.uniform(-1.0, 1.0, v.shape) for n, v in truth.items()}
         age = PHYSICS_DT * (len(self._late) - 1)
-        return seen | {"ball_age": np.array([age]), "ball_new": np.ones(1)}  # a frame at each control step
+        stamps = dict.fromkeys(("base_age", "ball_age"), np.array([age]))
+        return seen | stamps | dict.fromkeys(("base_new", "ball_new"), np.ones(1))  # a frame at each control step
 
     @property
     def blade(self) -> Blade:

@@ -44,7 +44,7 @@ class Command:
 COMMANDS = {
     "train": Command(
         module="pace.rl.train",
-        work="pace.rl.session:train_from_config",
+        work="pace.rl.train:train_from_config",
         failures=("pace.distributed:ProcessGroupError", "pace.rl.rollout:RolloutError", CHECKPOINT_ERROR),
         config="train",
         summary="train a policy and its predictor",

@@ -121,6 +121,11 @@ LIMITS: dict[str, dict[str, Limits]] = {
     },
     "ObservationConfig": {"policy_history": (1, 1000), "critic_history": (1, 1000)},
     "Prior": {"mean": (-1e6, 1e6), "std": (TINY, 1e6)},
+    "FlightFit": {
+        "noise": (TINY, 1.0), "contact_height": (0.0, 100.0), "low": (0.0, 100.0), "after_bounce": SECONDS,
+        "least_gravity": (TINY, 1000.0), "launch_width": (TINY, 1e6), "bounce_width": (TINY, 1e6),
+        "rebound_width": (TINY, 1e6), "restitution": SHARE, "friction": COEFFICIENT,
+    },
     "PredictorConfig": {
         "frames": (1, 1000), "hidden": SIZE, "learning_rate": (TINY, 10.0), "batch_size": (1, 10**7),
         "batches_per_update": (1, 10**6), "train_updates": (0, 10**9),
@@ -135,6 +140,10 @@ LIMITS: dict[str, dict[str, Limits]] = {
         "learning_rate_min": (0.0, 10.0), "learning_rate_max": (0.0, 10.0), "max_grad_norm": (TINY, 1e9),
         "observation_clip": (TINY, 1e9), "last_layer_gain": FACTOR, "fp32_below": AMPLITUDE, "params": ANY,
         "skips": (0, 10**6),
+    },
+    "JudgeConfig": {
+        "serves": (0, 10**7), "worlds": (1, 10**6), "last_serves": (0, 10**7), "last_worlds": (1, 10**6),
+        "warmup_serves": (0, 1000), "physics_dt": STEP, "after": (0.0, 1e6), "video": (0.0, 1e5),
     },
     "PlanConfig": {
         "warm_up": (0, 10**6), "updates": COUNT, "seconds": SECONDS, "samples": (1.0, 1e15),

@@ -65,6 +65,35 @@ class PredictorPriors:
 
 
 @dataclass
+class FlightFit:
+    """Numbers of the fit of a whole flight (:mod:`pace.predictor.filter`). The defaults are those of predictors that
+    were saved before these were configuration.
+
+    Attributes: ``noise`` m, standard deviation of a sensed position; ``contact_height`` m, of a ball's centre on the
+    table; ``low`` m, a ball that starts to rise below it has bounced; ``after_bounce`` s, positions that follow a
+    bounce sooner are on neither parabola; ``least_gravity`` m/s^2 downwards; standard deviations (x, y, z) of the
+    priors: ``launch_width`` m of the first position, ``bounce_width`` m and ``rebound_width`` m/s of position and
+    velocity after the bounce; ``restitution`` and ``friction`` of the table.
+    """
+
+    noise: float = 0.004
+    contact_height: float = 0.78
+    low: float = 0.9
+    after_bounce: float = 0.013
+    least_gravity: float = 5.0
+    launch_width: list[float] = field(default_factory=lambda: [1.0, 1.0, 1.0])
+    bounce_width: list[float] = field(default_factory=lambda: [0.003, 0.003, 0.003])
+    rebound_width: list[float] = field(default_factory=lambda: [0.25, 0.06, 0.06])
+    restitution: float = 0.92
+    friction: float = 0.225
+
+    def __post_init__(self) -> None:
+        for name in ("launch_width", "bounce_width", "rebound_width"):
+            width = getattr(self, name)
+            require(len(width) == 3, f"predictor.fit.{name} needs 3 numbers, got {len(width)}")
+
+
+@dataclass
 class PredictorConfig:
     """The learned predictor of the ball's apex and its online regression."""
 
@@ -80,6 +109,7 @@ class PredictorConfig:
     features: str = "steps"  # steps (positions alone), counted (the last five, and how many there were before them) or
     # flight (a fit of the whole flight), which both need many frames; or from outside: my_module:MyPredictor
     priors: PredictorPriors | None = None  # null: derived from the serve when a run starts, and saved with it
+    fit: FlightFit = field(default_factory=FlightFit)  # of features=flight, and of the priors that are derived
 
     def __post_init__(self) -> None:
         known = self.features in FEATURES or plugins.may_be_outside(plugins.PREDICTORS, self.features)

@@ -122,9 +122,9 @@ class RandomizationConfig:
 
 @dataclass
 class MocapConfig:
-    """Frames of a motion-capture system. The defaults are off: a frame a control step, as old as ``mocap_delay``."""
+    """Frames of a motion-capture system. The defaults are one a control step, as old as ``mocap_delay``."""
 
-    rate: float = 0.0  # Hz, of frames; 0: off
+    rate: float = 0.0  # Hz, of frames that come by themselves; 0: one a control step
     white_noise: float = 0.0  # m, standard deviation of each axis of base and ball, independent in each frame
     slow_noise: float = 0.0  # m, standard deviation of each axis of base and ball, first-order autoregressive
     slow_noise_time: float = 0.06  # s, its time constant
@@ -144,6 +144,8 @@ class MocapConfig:
             value = getattr(self, name)
             check_range(f"sensing.mocap.{name}", value, lowest=0.0)
             require(value[1] < math.inf, f"sensing.mocap.{name} must be finite, got {value}")
+        for name in ("gap_rate", "occlusion"):
+            require(self.rate > 0.0 or getattr(self, name) == 0.0, f"sensing.mocap.{name} needs sensing.mocap.rate")
 
 
 @dataclass

@@ -35,7 +35,7 @@ class ServeConfig:
     random_phase: bool  # first episodes begin at a random serve, to desynchronise the resets
     head_start: Range = field(default_factory=lambda: [0.0, 0.0])  # s of its flight that an episode's first serve skips
     # With more than one attempt, a serve is resampled until it lands first on the robot's half, without the net, and
-    # within these limits (null: none), by its forecast; a serve that fails every attempt is played as it is.
+    # within these limits (null: none), by its forecast; a world without a good one repeats its last.
     attempts: int = 1
     speed: list[float] | None = None  # m/s, of the launch
     bounce_x: list[float] | None = None  # m

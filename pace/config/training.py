@@ -9,6 +9,7 @@ from omegaconf import DictConfig
 
 from pace.config import automatic, plugins
 from pace.config.base import Completed, compose, parse, require
+from pace.config.judge import JudgeConfig
 from pace.config.names import check_renamed
 from pace.config.predictor import FRAME_DT
 from pace.config.schedules import Position, SchedulePoint, Stage, check_begins, in_shares
@@ -40,10 +41,10 @@ class AlgoConfig:
     max_grad_norm: float
     observation_clip: float
     last_layer_gain: float
-    # mixed (bf16, and fp32 from a std of fp32_below on), bf16, fp32; auto: mixed if the hardware supports it, else fp32
+    # mixed (bf16; the actor in fp32 from a std of fp32_below on), bf16, fp32; auto: mixed, or fp32 without bf16
     autocast: str
     later_steps: list[SchedulePoint] = field(default_factory=list)  # in place of steps, from a place in the run on
-    fp32_below: float = 0.0  # mean std of the policy below which autocast=mixed computes in float32
+    fp32_below: float = 0.0  # mean std of the policy below which with autocast=mixed the actor is float32
     algorithm: str = "ppo"  # or a class from outside: my_module:MyAlgorithm
     params: dict[str, float] = field(default_factory=dict)  # numbers of an algorithm from outside
     skips: int = 0  # updates in a row that are skipped because they are not finite, before the run stops
@@ -120,6 +121,7 @@ class TrainConfig(TaskConfig, Completed):
     predictor_from: str | None = field(default=None, kw_only=True)
     curriculum: list[Stage] = field(default_factory=list, kw_only=True)  # each changes the task of the one before
     plan: PlanConfig = field(default_factory=PlanConfig, kw_only=True)
+    judge: JudgeConfig = field(default_factory=JudgeConfig, kw_only=True)
     plugins: list[str] = field(default_factory=list, kw_only=True)  # modules that add terms, observations, ...
 
     @classmethod
@@ -167,5 +169,5 @@ def load_train_config(overrides: list[str] | None = None) -> TrainConfig:
 # Another number of processes means new worlds; with out=, a new run folder goes on from the checkpoint.
 RESUME_KEYS = (
     "resume", "samples", "minutes", "checkpoint_minutes", "tensorboard", "progress", "device", "processes", "plugins",
-    "out",
+    "out", "judge.serves", "judge.last_serves", "judge.after", "judge.video",
 )  # fmt: skip

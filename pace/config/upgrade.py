@@ -18,8 +18,8 @@ from pace.config.task import SPINS
 
 #: Format that this version writes. 1: version 0.1.0 up to commit 43400ac; 2: up to 72b96bb, before the true world;
 #: 3: up to 8d3869a, before gears had play and motors the maker's numbers; 4: up to cd18fd6, before the free hand on the
-#: table had its own outcome.
-FORMAT = 5
+#: table had its own outcome; 5: up to 027ac53, before the frame with the base had an age and a good serve was repeated.
+FORMAT = 6
 
 #: Landing target of a saved configuration without one (released configuration).
 LANDING_TARGET = (1.15, 0.0)  # m
@@ -204,6 +204,22 @@ def count_the_free_hand(state: Saved) -> None:
         env["statistics.sums"][:-1] = sums
 
 
+def stamp_the_base(state: Saved) -> None:
+    """The frame with the base has an age, as motion capture with frames of its own kept it for itself."""
+    for env in _environments(state):
+        over, delay = env["game.ends.over"], env["sensing._delay"]
+        env["sensing.base_age"] = env.pop("sensing.mocap._base_age", 0.02 * delay)
+        env["sensing.base_new"] = over.new_ones(over.shape)
+        env["sensing._slow"] = delay.new_zeros(len(delay), 6)
+
+
+def remember_a_good_serve(state: Saved) -> None:
+    """A world repeats its last serve that landed well if it finds no other: so far, the last that it sampled."""
+    for env in _environments(state):
+        env["serves.good"] = env["serves.sampled"].clone()
+        env["serves.good_about"] = env["serves.sampled"].new_zeros(len(env["serves.sampled"]), 3)
+
+
 def _environments(state: Saved) -> Iterator[Saved]:
     """The saved tensors of each process's environment; none in a state without processes."""
     for process in state.get("processes") or ():
@@ -240,6 +256,8 @@ STATE_UPGRADES: list[Upgrade] = [
     (4, add_what_motors_and_joints_sample),
     (4, add_the_body),
     (5, count_the_free_hand),
+    (6, stamp_the_base),
+    (6, remember_a_good_serve),
 ]
 
 

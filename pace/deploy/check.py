@@ -15,6 +15,7 @@ from pace.config.overrides import ON_A_CPU
 from pace.config.training import TrainConfig
 from pace.deploy.graph import StateLayout, input_ports, output_ports, readings
 from pace.rl.policies import TaskPolicy
+from pace.sim.sensing import STAMPS
 from pace.task.env import TableTennisEnv
 
 ACTION_NOISE = 0.3  # standard deviation added to the actions while observations are recorded, so that they vary
@@ -48,8 +49,7 @@ class RawReadings:
         sensing = self._env.sensing
         frame = {name: getattr(sensing, name) for name in readings(0)}
         frame["joint_position"] = sensing.joint_position + self._env.worlds.nominal
-        frame["ball_age"] = sensing.ball_age.unsqueeze(1)
-        frame["ball_new"] = sensing.ball_new.float().unsqueeze(1)
+        frame |= {name: getattr(sensing, name).float().unsqueeze(1) for name in STAMPS}
         frame["state"] = self.state
         return {name: value.contiguous().numpy() for name, value in frame.items()}
 

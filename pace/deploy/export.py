@@ -39,14 +39,15 @@ from pace.sim.robot_spec import RobotSpec
 from pace.task.observations import POLICY, layout
 
 FILE = "policy.onnx"  # in the folder that the command writes
-FORMAT = 4  # of the metadata; 4: one frame of readings, with the ball's age but not its launch, and one state
+#: Of the metadata. 4: one frame of readings, with the ball's age but not its launch, and one state; 5: the base's age.
+FORMAT = 5
 #: What lies outside the file.
 PROCEDURE = (
     "Run at 1 / control_dt Hz: give the current readings, and as state the state_next of the call before. A state of "
     "zeros starts from scratch: at the start, after a fall and with another paddle, not with every ball: a new ball is "
-    "found from its positions. While no frame shows the ball, repeat its last position with ball_new 0. Send "
-    "joint_target to the position controllers with the gains kp and kd. World frame: origin on the floor below the "
-    "table's centre, x towards the opponent, y to the robot's left, z up."
+    "found from its positions. While no frame shows the ball, repeat its last position with ball_new 0; likewise for "
+    "the base. Send joint_target to the position controllers with the gains kp and kd. World frame: origin on the "
+    "floor below the table's centre, x towards the opponent, y to the robot's left, z up."
 )
 
 

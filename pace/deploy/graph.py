@@ -48,6 +48,8 @@ def readings(joints: int) -> dict[str, Port]:
         "joint_position": Port(joints, "rad", "in the order of joint_names, not relative to the nominal pose"),
         "joint_velocity": Port(joints, "rad/s", "in the order of joint_names"),
         "ball_position": Port(3, "m", "centre of the ball, world frame; without a new frame its last"),
+        "base_age": Port(1, "s", "time since the frame with base position and heading was captured"),
+        "base_new": Port(1, "0 or 1", "1: a frame with them arrived since the call before"),
         "ball_age": Port(1, "s", "time since the ball's frame was captured"),
         "ball_new": Port(1, "0 or 1", "1: a frame with the ball arrived since the call before"),
     }
@@ -130,14 +132,16 @@ class DeployedPolicy(nn.Module):
         joint_position: Tensor,
         joint_velocity: Tensor,
         ball_position: Tensor,
+        base_age: Tensor,
+        base_new: Tensor,
         ball_age: Tensor,
         ball_new: Tensor,
         state: Tensor,
     ) -> tuple[Tensor, ...]:
         """One control step; see the class."""
         body = (base_angular_velocity, base_position, projected_gravity, heading)
-        ball = (ball_position, ball_age[:, 0], ball_new[:, 0] > 0.5)
-        sensing = Readings(*body, joint_position - self.nominal, joint_velocity, *ball)
+        stamps = (base_age[:, 0], base_new[:, 0] > 0.5, ball_age[:, 0], ball_new[:, 0] > 0.5)
+        sensing = Readings(*body, joint_position - self.nominal, joint_velocity, ball_position, *stamps)
         past = self.state.split(state)
         started = past["started"] > 0.5
         track = Track(past["track"], past["turned"][:, 0] > 0.5, started[:, 0], past["age"][:, 0])

@@ -24,6 +24,8 @@ TABLE_PARTS = ("robot", "ball", "engine", "randomization", "sensing")
 TOLD_PARTS = ("robot", "ball", "randomization", "sensing")
 #: Of the serves, what rows do not set.
 PAUSES = ("pause", "first_pause", "pause_ball")
+#: Of the serves, what rows set.
+LAUNCH = ("x", "y", "z", "vx", "vy", "vz", *SPINS, "speed", "bounce_x", "bounce_y")
 #: Differences in one part that are listed; more are counted.
 LISTED = 3
 
@@ -101,5 +103,13 @@ def task_line(task: str, saved: TrainConfig, played: TrainConfig) -> str:
     if task != "own":
         told = differences(saved, played)
         line += f"; task=own has {', '.join(told)}" if told else "; task=own is the same"
-    spun = [f"serve.{name}" for name in SPINS if any(getattr(saved.serve, name))]
-    return f"{line}; trained with {', '.join(spun)}, which the rows set" if spun else line
+    served = _served(saved.serve)
+    return f"{line}; trained with {', '.join(served)}, which the rows set" if served else line
+
+
+def _served(serve: ServeConfig) -> list[str]:
+    """What a policy was trained with of what rows set: another choice of serves than the usual, or other ranges."""
+    usual = parse(compose("train"), TrainConfig).serve
+    if serve.name != usual.name:
+        return [f"serve={serve.name}"]
+    return [f"serve.{name}" for name in LAUNCH if getattr(serve, name) != getattr(usual, name)]

@@ -27,8 +27,9 @@ class Readings(NamedTuple):
     """One frame of the sensors, as those of :class:`pace.sim.sensing.Sensing`: ``base_angular_velocity`` (N, 3) rad/s
     and ``projected_gravity`` (N, 3), body frame; ``base_position``, ``ball_position`` (N, 3) m and ``heading`` (N, 2),
     world frame; ``joint_position`` (N, J) rad relative to the nominal pose, ``joint_velocity`` (N, J) rad/s;
-    ``ball_age`` (N,) s since the ball's frame was captured, ``ball_new`` (N,) bool, it arrived since the last control
-    step (else the ball's last position is repeated)."""
+    ``base_age`` (N,) s since the frame with base position and heading was captured, ``base_new`` (N,) bool, it arrived
+    since the last control step (else its values are repeated); ``ball_age`` and ``ball_new`` (N,), the same of the
+    frame with the ball."""
 
     base_angular_velocity: Tensor
     base_position: Tensor
@@ -37,6 +38,8 @@ class Readings(NamedTuple):
     joint_position: Tensor
     joint_velocity: Tensor
     ball_position: Tensor
+    base_age: Tensor
+    base_new: Tensor
     ball_age: Tensor
     ball_new: Tensor
 

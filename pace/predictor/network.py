@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from pace.config import plugins
 from pace.config.base import ConfigError
-from pace.config.predictor import COUNTED_FRAMES, FEATURES, PredictorConfig, PredictorPriors, Prior
+from pace.config.predictor import COUNTED_FRAMES, FEATURES, FlightFit, PredictorConfig, PredictorPriors, Prior
 from pace.predictor.filter import FlightFilter
 
 OUTPUT_SIZES = {"apex": 3, "target": 3, "target_time": 1}
@@ -43,9 +43,9 @@ class FlightFeatures(nn.Module):
     scale: Tensor
     size = 26
 
-    def __init__(self, frames: int, priors: PredictorPriors) -> None:
+    def __init__(self, frames: int, priors: PredictorPriors, fit: FlightFit) -> None:
         super().__init__()
-        self.filter = FlightFilter(frames, priors)
+        self.filter = FlightFilter(frames, priors, fit)
         (age, spread), (start, bounced) = ((prior.mean[0], prior.std[0]) for prior in (priors.age, priors.bounced))
         times = Prior([age, 0.0, age, start, 0.0], [spread, spread, spread, bounced, 1.0])
         before, after = (priors.position, priors.fall_velocity, priors.fall), (priors.rise_velocity, priors.rise)
@@ -125,7 +125,7 @@ class PredictorNetwork(BallPredictor):
 
     def __init__(self, config: PredictorConfig) -> None:
         super().__init__(config)
-        self.flight = FlightFeatures(config.frames, self.priors) if config.features == "flight" else None
+        self.flight = FlightFeatures(config.frames, self.priors, config.fit) if config.features == "flight" else None
         self.register_scaling("position", self.priors.position)
         self.register_scaling("step", self.priors.step)
         self.counted = config.features == "counted"

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from pace.config.base import Range
-from pace.config.predictor import FRAME_DT, PredictorConfig, PredictorPriors, Prior
+from pace.config.predictor import FRAME_DT, FlightFit, PredictorConfig, PredictorPriors, Prior
 from pace.config.task import TaskConfig
 from pace.predictor.filter import Parabola, rebound, time_to_table
 
@@ -52,16 +52,16 @@ MEASURED_ON = Launches(
 
 def resolve_priors(config: TaskConfig, learned: PredictorPriors | None = None) -> PredictorConfig:
     """The predictor's configuration with priors: the given ones, those of ``learned`` weights, or the serve's."""
-    found = config.predictor.priors or learned or derive_priors(Launches.of(config))
+    found = config.predictor.priors or learned or derive_priors(Launches.of(config), config.predictor.fit)
     return replace(config.predictor, priors=found)
 
 
-def derive_priors(launches: Launches) -> PredictorPriors:
+def derive_priors(launches: Launches, fit: FlightFit) -> PredictorPriors:
     """Priors for these serves."""
     measured = PredictorPriors()
-    middle, corners = _accepted(launches) if launches.limits else _middle_and_corners(launches)
-    here, there = _flights(middle, launches), _flights(_middle_and_corners(MEASURED_ON)[0], MEASURED_ON)
-    reach = _flights(corners, launches), _flights(_middle_and_corners(MEASURED_ON)[1], MEASURED_ON)
+    middle, corners = _accepted(launches, fit) if launches.limits else _middle_and_corners(launches)
+    here, there = _flights(middle, launches, fit), _flights(_middle_and_corners(MEASURED_ON)[0], MEASURED_ON, fit)
+    reach = _flights(corners, launches, fit), _flights(_middle_and_corners(MEASURED_ON)[1], MEASURED_ON, fit)
     found: dict[str, Prior] = {}
     for name in here:
         prior: Prior = getattr(measured, name)
@@ -91,7 +91,7 @@ def _middle_and_corners(launches: Launches) -> tuple[Tensor, Tensor]:
     return middle, torch.tensor(list(product(*ranges)), dtype=torch.float64)
 
 
-def _accepted(launches: Launches) -> tuple[Tensor, Tensor]:
+def _accepted(launches: Launches, fit: FlightFit) -> tuple[Tensor, Tensor]:
     """Mean (1, 6) and all (M, 6) of a grid of launches in the ranges whose flights keep the limits.
 
     The middle and the corners of the ranges do not stand for serves of which most are resampled. If the flight model
@@ -100,7 +100,7 @@ def _accepted(launches: Launches) -> tuple[Tensor, Tensor]:
     ranges = (*launches.position, *launches.velocity)
     axes = [torch.linspace(low, high, GRID if high > low else 1, dtype=torch.float64) for low, high in ranges]
     grid = torch.cartesian_prod(*axes)
-    bounce = _flights(grid, launches)["bounce"]
+    bounce = _flights(grid, launches, fit)["bounce"]
     limited = {"speed": grid[:, 3:].norm(dim=1), "bounce_x": bounce[:, 0], "bounce_y": bounce[:, 1]}
     kept = torch.ones(len(grid), dtype=torch.bool)
     for name, (low, high) in launches.limits.items():
@@ -109,17 +109,17 @@ def _accepted(launches: Launches) -> tuple[Tensor, Tensor]:
     return (found.mean(0, keepdim=True), found) if len(found) else _middle_and_corners(launches)
 
 
-def _flights(launch: Tensor, launches: Launches) -> dict[str, Tensor]:
+def _flights(launch: Tensor, launches: Launches, fit: FlightFit) -> dict[str, Tensor]:
     """Quantities of the flights of ``launch`` (N, 6), by the name of the prior, (N, 3) or (N, 1)."""
     measured, velocity = PredictorPriors(), launch[:, 3:]
     fall = _slowed(velocity, measured.fall, measured.launch_velocity)
     before = Parabola(launch[:, :3], velocity, fall)
-    bounce_time = time_to_table(before)
+    bounce_time = time_to_table(before, fit)
     bounce = before.at(bounce_time)
-    rebounding = rebound(bounce.velocity)
+    rebounding = rebound(bounce.velocity, fit)
     rise = _slowed(rebounding, measured.rise, measured.rise_velocity)
     after = Parabola(bounce.position, rebounding, rise)
-    rise_time = rebounding[:, 2:] / after.gravity
+    rise_time = rebounding[:, 2:] / after.gravity(fit.least_gravity)
     apex = after.at(rise_time).position
     target = torch.cat([torch.full_like(apex[:, :1], launches.target_x), apex[:, 1:]], dim=1)
     level = torch.tensor([1.0, 1.0, 0.0])  # a serve falls as far as it rises

@@ -20,6 +20,10 @@ class KLAdaptiveRate:
         self._rate, self._lowest, self._highest = rate, lowest, highest
         self.target = torch.zeros_like(rate)
 
+    def begin_at(self, rate: float) -> None:
+        """The rate of the next step."""
+        self._rate.fill_(rate)
+
     def adapt(self, kl: Tensor) -> None:
         """Lower the rate if ``kl`` () is more than twice the target; raise it if ``kl`` is positive and less than half
         of it. A ``kl`` that is not finite is not judged here."""

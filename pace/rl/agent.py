@@ -203,22 +203,23 @@ class Agent(nn.Module):
         self.policy_norm = RunningNorm(policy_size, config.observation_clip, config.observation_norm)
         self.critic_norm = RunningNorm(critic_size, config.observation_clip, config.observation_norm)
         self.actor = GaussianActor(policy_size, actions, config, self.observation_dtype)
-        self.critic = MLP(critic_size, config.critic_hidden, 1, 1.0, self.observation_dtype)
+        self.critic = MLP(critic_size, config.critic_hidden, 1, 1.0, self.fast_dtype)
         self.to(device)
 
     def choose_dtype(self, std: float) -> None:
-        """Compute in float32 once the policy's mean ``std`` is so small that rounding to bf16 is comparable to it.
+        """Act in float32 once the policy's mean ``std`` is so small that rounding to bf16 is comparable to it.
 
         The rounding errors differ with every change of the weights: the KL divergence of an update then measures the
-        rounding, and the learning rate, which follows the KL divergence, falls to its floor. There is no way back:
-        each change replaces the storage of the rollouts and the graphs on it.
+        rounding, and the learning rate, which follows the KL divergence, falls to its floor. The critic's values
+        are not compared so, and it stays as it is. There is no way back: each change replaces the storage of the
+        rollouts and the graphs on it.
         """
         self.compute_fine(self.fine or std < self.fp32_below)
 
     def compute_fine(self, fine: bool) -> None:
-        """Compute in float32 from now on, or in the configured format."""
+        """The actor computes in float32 from now on, or in the configured format."""
         self.fine = fine
-        self.observation_dtype = self.actor.mlp.dtype = self.critic.dtype = torch.float32 if fine else self.fast_dtype
+        self.observation_dtype = self.actor.mlp.dtype = torch.float32 if fine else self.fast_dtype
 
     def actor_operator(self) -> ProbabilisticTensorDictSequential:
         """The actor as a TorchRL module: normalised ``policy`` -> ``loc``, ``scale`` -> ``action``."""

@@ -211,6 +211,7 @@ class AsymmetricPPO:
         self.agent = Agent(*sizes, config, device)
         self.ppo = PPO(self.agent, config, group)
         self._finish = Bound(self._make_finish, rollout=None)
+        self._begins = ""
 
     def prepare(self, env: VectorTask, at: Position) -> int:
         """Allocate storage for these worlds in the networks' number format, and apply ``algo.later_steps``."""
@@ -264,18 +265,25 @@ class AsymmetricPPO:
         return self.agent.policy_norm, self.agent.critic_norm
 
     def weights_loaded(self, new_run: bool) -> None:
-        """A new run begins with the standard deviation of its configuration."""
+        """A new run begins with a standard deviation of its configuration, and with steps that the loaded one allows:
+        the KL divergence of a step grows with the square of the learning rate over the standard deviation."""
         if new_run:
             self.agent.actor.bound_std(self.config.std_floor, scheduled(self.config.std, START))
+            std = self.agent.actor.std.mean().item()
+            share = std / self.config.std[0].value
+            rate = max(self.config.learning_rate * share**2, self.config.learning_rate_min)
+            if rate < self.config.learning_rate:
+                self.ppo.schedule.begin_at(rate)
+                self._begins = f", the actor's learning rate at {rate:.2g} first, as a std of {std:.2g} allows"
         self.agent.choose_dtype(self.agent.actor.std.mean().item())
 
     def describe(self) -> str:
-        """The networks' number format."""
+        """The networks' number format; how a run that starts from weights begins."""
         agent = self.agent
         number_format = str(agent.observation_dtype).removeprefix("torch.")
         if agent.observation_dtype != torch.float32 and agent.fp32_below > 0.0:
-            number_format += f" (float32 below a std of {agent.fp32_below:g})"
-        return f"networks in {number_format}"
+            number_format += f" (the actor in float32 below a std of {agent.fp32_below:g})"
+        return f"networks in {number_format}{self._begins}"
 
     def state_dict(self) -> dict[str, Any]:
         """See :meth:`PPO.state_dict`; and whether the networks have come to float32."""

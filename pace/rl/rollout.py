@@ -93,11 +93,10 @@ class Rollout:
         worlds, policy_size = env.policy_observation.shape
         device = env.policy_observation.device
         critic_size = env.critic_observation.shape[1]
-        stored = {"dtype": agent.observation_dtype, "device": device}
         self.env, self.agent, self.steps, self.num_worlds = env, agent, steps, worlds
-        self.policy = torch.zeros(steps, worlds, policy_size, **stored)
+        self.policy = torch.zeros(steps, worlds, policy_size, dtype=agent.observation_dtype, device=device)
         # rows `steps` and `steps + 1`: the observation after the last step, and that of truncated worlds before reset
-        self.critic = torch.zeros(steps + 2, worlds, critic_size, **stored)
+        self.critic = torch.zeros(steps + 2, worlds, critic_size, dtype=agent.critic.dtype, device=device)
         self.action = torch.zeros(steps, worlds, agent.num_actions, device=device)
         self.loc = torch.zeros_like(self.action)
         self.scale = torch.ones(agent.num_actions, device=device)

@@ -5,6 +5,7 @@ This is what ``python -m pace.rl.train`` does.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,6 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from pace.arrays.graph import Graphs, graphs_of
 from pace.config import automatic
 from pace.config.base import ConfigError, parse, to_dict
+from pace.config.judge import JudgeConfig
 from pace.config.predictor import PredictorPriors
 from pace.config.schedules import START, position_of
 from pace.config.training import RESUME_KEYS, TrainConfig
@@ -27,6 +29,7 @@ from pace.distributed import ProcessGroup, is_first_here, launched_size, own_dev
 from pace.predictor.network import BallPredictor, make_predictor
 from pace.predictor.priors import resolve_priors
 from pace.rl.curriculum import Curriculum
+from pace.rl.judge import Judge
 from pace.rl.kernels import warm
 from pace.rl.plan import in_millions
 from pace.rl.policies import locate
@@ -40,11 +43,18 @@ from pace.runs.run_folder import METRICS, RunFolder, is_run
 
 if TYPE_CHECKING:
     from pace.task.env import TableTennisEnv
+
+#: Makes the judge of a run; films its newest policy for so long, s.
+MakeJudge = Callable[[JudgeConfig], Judge]
+Film = Callable[[Path, float], None]
 SEEDS_APART = 1_000_003  # between the stages of a curriculum: further than seeds of runs lie apart
 
 
-def train_from_config(composed: DictConfig) -> None:
-    """Train as the composed configuration says, and print what was written."""
+def train_from_config(composed: DictConfig, make_judge: MakeJudge | None = None, film: Film | None = None) -> None:
+    """Train as the composed configuration says, and print what was written.
+
+    A run that comes to its end is judged by what ``make_judge`` makes, and filmed.
+    """
     config = parse(composed, TrainConfig)
     hydra = HydraConfig.get()
     overrides = list(hydra.overrides.task)
@@ -67,10 +77,28 @@ def train_from_config(composed: DictConfig) -> None:
         trainer = build_trainer(config, saved, device, group)
         if trainer.run is not None:
             announce(trainer, trainer.run, saved, chosen)
+            trainer.judge = make_judge(config.judge) if make_judge else None
         summary = trainer.train()
-    if summary is not None:
-        report(summary)
-        trainer.stop.require_not_terminated()
+    if summary is None:
+        return
+    report(summary)
+    trainer.stop.require_not_terminated()
+    if trainer.judge is not None and trainer.stop.name is None:
+        close(trainer.judge, film, summary, config.judge)
+
+
+def close(judge: Judge, film: Film | None, summary: Summary, config: JudgeConfig) -> None:
+    """Tell and show what a finished run does without exploration, and what may come next; Ctrl-C leaves it out."""
+    run, minutes = summary.folder, summary.seconds / 60.0
+    if minutes < config.after:
+        return
+    try:
+        judge.last(run, minutes)
+        if film is not None and config.video > 0.0:
+            film(run, config.video)
+    except KeyboardInterrupt:
+        tell("left out; the run is complete")
+    tell(f"next: pace play {run} | pace evaluate {run} | pace export {run} out=robot")
 
 
 def machine_for(config: TrainConfig, device: torch.device) -> automatic.Machine:
@@ -230,7 +258,7 @@ def announce(trainer: Trainer, run: RunFolder, saved: Checkpoint | None, chosen:
 
 def report(summary: Summary) -> None:
     """Print how the run ended and which files it wrote."""
-    folder = summary.checkpoint.parent.parent
+    folder = summary.folder
     tell(
         f"{summary.reason}: {summary.updates} updates, {summary.samples:,} samples, {summary.seconds / 60:.1f} min\n"
         f"last updates: {', '.join([*rate_texts(summary.rates), *summary.faults])}\n"

@@ -19,6 +19,7 @@ from pace.predictor.regression import PredictorTrainer
 from pace.rl.agent import Sizes
 from pace.rl.algorithm import ALGORITHMS
 from pace.rl.curriculum import Curriculum
+from pace.rl.judge import Judge
 from pace.rl.plan import Plan
 from pace.rl.recovery import Recovery
 from pace.rl.rollout import TrainableTask
@@ -44,6 +45,11 @@ class Summary:
     curve: Path | None
     rates: dict[str, float]
     faults: list[str]  # in words
+
+    @property
+    def folder(self) -> Path:
+        """The run's folder."""
+        return self.checkpoint.parent.parent
 
 
 class Trainer:
@@ -82,6 +88,8 @@ class Trainer:
         learners = {LEARNER: self.algorithm, "regression": self.regression}
         self._recovery = Recovery(config, dict(self._networks()), learners, run, group)
         self.stop = StopRequest()
+        #: Of the run's policy, after each checkpoint; only rank 0 has one.
+        self.judge: Judge | None = None
         self._saved_at = time.monotonic()
 
     def train(self) -> Summary | None:
@@ -100,12 +108,13 @@ class Trainer:
         progress = Progress(shown, config.samples, 60.0 * config.minutes, self.samples)
         started = last = time.monotonic()
         wall_before, reason, newest = self.wall_s, None, None
+        judged: dict[str, float] = {}
         try:
             if self.run is not None:
                 self.run.begin()
             with self.stop.listening():
                 while reason is None:
-                    row = self._safe_update()
+                    row = self._safe_update() | judged
                     now = time.monotonic()
                     self.wall_s = wall_before + now - started
                     row |= {"wall_s": self.wall_s, "samples_per_s": self._samples_per_update / (now - last)}
@@ -117,6 +126,7 @@ class Trainer:
                     reason, due = self.group.broadcast_object((self._reason_to_end(now - started), self._save_is_due()))
                     if (due and not self._recovery.in_a_row) or reason is not None:
                         newest = self.save(last=reason is not None)
+                    judged = self._judge(newest) if due and reason is None else {}
         finally:
             progress.close()
             if self.run is not None:
@@ -202,6 +212,12 @@ class Trainer:
         checkpoint = self.checkpoint()
         self._saved_at = time.monotonic()
         return self.run.save(self.updates, checkpoint, last) if self.run is not None else None
+
+    def _judge(self, checkpoint: Path | None) -> dict[str, float]:
+        """The judgement of a checkpoint that was just written, for the next row of the metrics."""
+        if self.judge is None or checkpoint is None:
+            return {}
+        return self.judge.quick(checkpoint, self.wall_s / 60.0)
 
     def checkpoint(self) -> Checkpoint:
         """Everything that the next update depends on, of all ranks."""

@@ -5,12 +5,31 @@ from __future__ import annotations
 import math
 from io import BytesIO
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pace.runs.files import reason, say, write_whole
 from pace.runs.metrics import read_metrics
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 CURVE = "learning_curve.png"
 CURVE_WINDOW = 40  # rows of the moving average in the plot
+#: Label of each panel, and its curves: column, name, factor. Those that begin with ``eval_`` are few: judgements.
+PANELS = (
+    (
+        "share of serves, %",
+        (
+            ("hit_rate", "hits", 100.0),
+            ("success_rate", "returns", 100.0),
+            ("eval_hit", "hits without exploration", 100.0),
+            ("eval_success", "returns without exploration", 100.0),
+        ),
+    ),
+    ("falls per s", (("fall_rate", "falls", 1.0),)),
+    ("predictor RMSE, cm", (("predictor_rmse_cm", "apex", 1.0),)),
+    ("policy std", (("policy_std", "std", 1.0),)),
+)
 
 
 def moving_average(values: list[float], window: int) -> list[float]:
@@ -22,6 +41,16 @@ def moving_average(values: list[float], window: int) -> list[float]:
     return result
 
 
+def _draw(axes: Axes, millions: list[float], values: list[float], name: str, dots: bool) -> None:
+    """A moving average; or ``dots``, values that are far apart."""
+    if not dots:
+        axes.plot(millions, moving_average(values, CURVE_WINDOW), label=name)
+        return
+    known = [(x, value) for x, value in zip(millions, values, strict=True) if not math.isnan(value)]
+    if known:
+        axes.plot(*zip(*known, strict=True), "o--", markersize=4, linewidth=1, label=name)
+
+
 def plot_learning_curve(run: str | Path) -> Path | None:
     """Draw ``learning_curve.png`` from the run's CSV; None when it has fewer than two rows, or cannot be written."""
     from matplotlib.figure import Figure  # imported here: it takes a second that no training should wait for
@@ -31,21 +60,13 @@ def plot_learning_curve(run: str | Path) -> Path | None:
     if len(metrics.get("update", [])) < 2:
         return None
     millions = [samples / 1e6 for samples in metrics["samples"]]
-    panels = (
-        ("share of serves, %", (("hit_rate", "hits", 100.0), ("success_rate", "returns", 100.0))),
-        ("falls per s", (("fall_rate", "falls", 1.0),)),
-        ("predictor RMSE, cm", (("predictor_rmse_cm", "apex", 1.0),)),
-        ("policy std", (("policy_std", "std", 1.0),)),
-    )
     figure = Figure(figsize=(9, 10), layout="constrained")
-    for axes, (label, curves) in zip(figure.subplots(len(panels), 1, sharex=True), panels, strict=True):
+    for axes, (label, curves) in zip(figure.subplots(len(PANELS), 1, sharex=True), PANELS, strict=True):
         for column, name, factor in curves:
-            smooth = moving_average(metrics[column], CURVE_WINDOW)
-            axes.plot(millions, [factor * value for value in smooth], label=name)
+            if column in metrics:
+                _draw(axes, millions, [factor * value for value in metrics[column]], name, column.startswith("eval_"))
         axes.set_ylabel(label)
-        axes.update_datalim(
-            [(millions[0], 0.0)]
-        )  # zero is in view, and the upper margin is a share of the whole height
+        axes.update_datalim([(millions[0], 0.0)])  # zero is in view, the upper margin a share of the whole height
         axes.autoscale_view()
         axes.set_ylim(bottom=0)
         axes.grid(alpha=0.3)

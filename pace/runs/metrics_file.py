@@ -19,7 +19,7 @@ from pace.runs.files import AppendFile, write_whole
 
 LEADING = (
     "update", "samples", "wall_s", "samples_per_s", "hit_rate", "success_rate", "fall_rate", "predictor_rmse_cm",
-    "mean_reward", "kl", "lr", "policy_std",
+    "mean_reward", "kl", "lr", "policy_std", "eval_hit", "eval_success",
 )  # fmt: skip
 EVENTS_VERSION = "brain.Event:2"  # what readers of TensorBoard's files expect in their first event
 FIRST_COLUMN = "update,"  # begins a metrics.csv

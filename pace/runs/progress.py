@@ -20,6 +20,9 @@ RATES = {  # column: label, factor, digits, unit
     "fall_rate": ("falls", 1.0, 3, "/s"),
     "predictor_rmse_cm": ("predictor", 1.0, 1, " cm"),
 }
+FIRST = ("hit_rate", "success_rate")  # of the rates
+#: Columns of a judgement without exploration: hits and returns.
+JUDGED = ("eval_hit", "eval_success")
 #: Column of a fault -> its total in words.
 FAULTS = {"diverged": "{} worlds diverged", "skipped": "{} updates skipped"}
 WINDOW = 25  # updates over which the shown rates are taken
@@ -61,6 +64,7 @@ class Progress:
         self.recent: deque[dict[str, float]] = deque(maxlen=WINDOW)
         #: Totals of the run's faults: worlds that diverged, updates that were skipped.
         self.faults = dict.fromkeys(FAULTS, 0.0)
+        self._judged: dict[str, float] = {}
         self.started = time.monotonic()
         self._last_line = -math.inf
         self._enabled = enabled
@@ -73,6 +77,7 @@ class Progress:
         self.recent.append(row)
         for name in FAULTS:
             self.faults[name] += row.get(name, 0.0)
+        self._judged |= {name: row[name] for name in JUDGED if name in row}
         if not self._enabled:
             return
         fraction, left = self._remaining(row["samples"])
@@ -104,15 +109,25 @@ class Progress:
         return done, left
 
     def _describe(self, row: dict[str, float], left: float) -> str:
-        parts = [
-            f"update {row['update']:.0f}",
+        first, rest = {}, {}
+        for name, rate in self.rates().items():
+            (first if name in FIRST else rest)[name] = rate
+        parts = [  # what matters most comes first: a terminal of 80 columns cuts the line
+            f"{clock(left)} left",
+            *rate_texts(first),
+            *self.judged_texts(),
+            *self.fault_texts(),
             f"{row['samples'] / 1e6:.2f} M samples",
             f"{self.mean('samples_per_s'):,.0f}/s",
-            f"{clock(left)} left",
-            *rate_texts(self.rates()),
-            *self.fault_texts(),
+            *rate_texts(rest),
+            f"update {row['update']:.0f}",
         ]
         return " | ".join(parts)
+
+    def judged_texts(self) -> list[str]:
+        """The last judgement in words; nothing without one."""
+        shares = [f"{100.0 * self._judged[name]:.0f}" for name in JUDGED if name in self._judged]
+        return [f"judged {'/'.join(shares)} %"] if shares else []
 
     def fault_texts(self) -> list[str]:
         """The run's faults in words; nothing without one."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import torch
 import warp as wp
@@ -55,6 +56,7 @@ class Film:
     phase: wp.array[wp.float32]  # s since the last frame
     gap: wp.array[wp.float32]  # s left of a run of lost frames
     base_age: wp.array[wp.float32]  # s
+    base_new: wp.array[wp.bool]
     ball_age: wp.array[wp.float32]  # s
     ball_new: wp.array[wp.bool]
     sensed: wp.array2d[wp.float32]
@@ -115,7 +117,7 @@ def _capture(
 
 
 @wp.func
-def _drift(cameras: Cameras, slow: wp.array[wp.float32], kept: float, seed: int, number: int):
+def drift(cameras: Cameras, slow: wp.array[wp.float32], kept: float, seed: int, number: int):
     """The slow noise one frame later; with ``kept`` 0 from scratch."""
     for column in range(6):
         random = wp.rand_init(seed, SEQUENCES * number + VALUES + column)
@@ -179,7 +181,7 @@ def _begin(
     world = wp.tid()
     if not mask[world]:
         return
-    _drift(cameras, film.slow[world], 0.0, seed[world], 0)
+    drift(cameras, film.slow[world], 0.0, seed[world], 0)
     for column in range(TRUTH):
         film.truth[world, 0, column] = _truth(robot, ball_position, world, column)
     for slot in range(film.ring.shape[1]):
@@ -193,6 +195,7 @@ def _begin(
     film.phase[world] = cameras.period * wp.randf(wp.rand_init(seed[world], SEQUENCES - 1))
     film.gap[world] = 0.0
     film.base_age[world] = film.delay[world] * cameras.control_dt
+    film.base_new[world] = True
     film.ball_age[world] = wp.where(in_view[world], film.delay[world] * cameras.control_dt, UNSEEN)
     film.ball_new[world] = in_view[world]
 
@@ -222,7 +225,7 @@ def _advance(
     while time <= control_dt:
         number += 1
         frame = ring[_oldest(ring)]
-        _drift(cameras, slow, cameras.kept, seed[world], number)
+        drift(cameras, slow, cameras.kept, seed[world], number)
         share = time / control_dt
         noise = film.scale[world]
         _capture(cameras, truth, share, mask[world], noise, film.amplitude, slow, frame, seed[world], number)
@@ -231,8 +234,10 @@ def _advance(
         film.gap[world] = _send(cameras, frame, film.gap[world], late, control_dt - time, seed[world], number)
         time += cameras.period
     film.phase[world] = control_dt - (time - cameras.period)
+    held = film.base_age[world] + control_dt
+    film.base_age[world] = _deliver(ring, False, held, film.sensed[world])
+    film.base_new[world] = film.base_age[world] < held
     held = film.ball_age[world] + control_dt
-    film.base_age[world] = _deliver(ring, False, film.base_age[world] + control_dt, film.sensed[world])
     film.ball_age[world] = _deliver(ring, True, held, film.sensed[world])
     film.ball_new[world] = film.ball_age[world] < held
 
@@ -246,10 +251,11 @@ class Mocap(Stateful):
 
     Args: config; control_dt: s; delay (N,) control steps and scale (N,) of the noise, both sampled by the owner;
     amplitude (8,) of uniform noise and sensed (N, 8), what the robot reads: base 3, ball 3, heading 2;
-    ball_age (N,) s and ball_new (N,) bool: of the ball's frame, and whether it arrived in this step.
+    stamps: ``base_age``, ``ball_age`` (N,) s of the frames that it holds, ``base_new``, ``ball_new`` (N,) bool, they
+    arrived in this step.
     """
 
-    STATE = ("_truth", "_slow", "_ring", "_phase", "_gap", "_base_age")
+    STATE = ("_truth", "_slow", "_ring", "_phase", "_gap")
 
     def __init__(
         self,
@@ -259,8 +265,7 @@ class Mocap(Stateful):
         scale: Tensor,
         amplitude: Tensor,
         sensed: Tensor,
-        ball_age: Tensor,
-        ball_new: Tensor,
+        stamps: Mapping[str, Tensor],
     ) -> None:
         self._device, self._count = delay.device, len(delay)
         frames = math.ceil((config.mocap_delay[1] + config.mocap.jitter[1] + control_dt) * config.mocap.rate) + 2
@@ -269,10 +274,10 @@ class Mocap(Stateful):
             return torch.zeros(self._count, *size, device=self._device)
 
         self._truth, self._slow, self._ring = zeros(2, TRUTH), zeros(6), zeros(frames, FRAME_COLUMNS)
-        self._phase, self._gap, self._base_age = zeros(), zeros(), zeros()
+        self._phase, self._gap = zeros(), zeros()
         own = {name.removeprefix("_"): getattr(self, name) for name in self.STATE}
         given = {"delay": delay, "scale": scale, "amplitude": amplitude}
-        self._film = given | own | {"ball_age": ball_age, "ball_new": ball_new, "sensed": sensed}
+        self._film = given | own | {**stamps, "sensed": sensed}
         self._cameras = cameras_of(config.mocap, control_dt)
 
     def record(
@@ -286,8 +291,8 @@ class Mocap(Stateful):
 
 
 def cameras_of(config: MocapConfig, control_dt: float) -> dict[str, float | list[float]]:
-    """The fields of :class:`Cameras`; ``control_dt`` in s."""
-    period = 1.0 / config.rate
+    """The fields of :class:`Cameras`; ``control_dt`` in s, between frames without a rate of their own."""
+    period = 1.0 / config.rate if config.rate > 0.0 else control_dt
     return {
         "control_dt": control_dt,
         "period": period,

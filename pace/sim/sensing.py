@@ -14,12 +14,14 @@ from torch import Tensor
 from pace.arrays.launch import Bound, MaskedLaunch
 from pace.arrays.state import Stateful, with_prefix
 from pace.config.sim import SensingConfig
-from pace.sim.mocap import UNSEEN, Mocap
+from pace.sim.mocap import SEQUENCES, UNSEEN, Cameras, Mocap, cameras_of, drift
 from pace.sim.robot_state import RobotArrays, RobotState
 
 #: Columns of a motion-capture frame: base position 3, ball position 3, heading 2; 1 in a new ball's first frame; 1 if
 #: the ball is in view.
 FRAME_COLUMNS = 10
+#: Of the newest frames with the base and with the ball: s since their capture; they arrived in this step.
+STAMPS = ("base_age", "base_new", "ball_age", "ball_new")
 BASE, BALL, HEADING, LAUNCHED, SEEN = wp.constant(0), wp.constant(3), wp.constant(6), wp.constant(8), wp.constant(9)
 
 
@@ -84,14 +86,18 @@ def _sense(
     scale: wp.array[wp.float32],
     scales: wp.vec2,
     amplitude: wp.array[wp.float32],
+    cameras: Cameras,
+    slow: wp.array2d[wp.float32],
     line: wp.array3d[wp.float32],
     sensed: wp.array2d[wp.float32],
+    base_age: wp.array[wp.float32],
+    base_new: wp.array[wp.bool],
     ball_age: wp.array[wp.float32],
     ball_new: wp.array[wp.bool],
 ):
     """Sense one world. With ``reset`` the masked worlds only, as if they had stood still, with a new delay (control
-    steps, from the range ``delays``) and a new scale of the noise; else the ball of the masked worlds is new. With
-    ``own_frames`` 1, :mod:`pace.sim.mocap` writes what motion capture gives."""
+    steps, from the range ``delays``) and a new scale of the noise; else the ball of the masked worlds is new, and the
+    frame of this step may be lost. With ``own_frames`` 1, :mod:`pace.sim.mocap` writes what motion capture gives."""
     world = wp.tid()
     if reset == 1 and not mask[world]:
         return
@@ -103,12 +109,21 @@ def _sense(
         scale[world] = scales[0] + wp.randf(random) * (scales[1] - scales[0])
     joints = nominal.shape[0]
     mocap = 6 + 2 * joints
-    seen = _in_view(line[world], delay[world]) and own_frames == 0
+    late, lost = wp.float32(delay[world]), bool(own_frames == 1)
+    if reset == 0 and own_frames == 0:
+        way = wp.rand_init(seed[world], SEQUENCES - 1)
+        late += (cameras.jitter[0] + wp.randf(way) * (cameras.jitter[1] - cameras.jitter[0])) / control_dt
+        lost = wp.randf(way) < cameras.lost or late * control_dt >= base_age[world] + control_dt  # that is no newer
+    if cameras.slow > 0.0 and own_frames == 0:
+        drift(cameras, slow[world], wp.where(reset == 1, 0.0, cameras.kept), seed[world], 0)
+    seen = _in_view(line[world], late) and not lost
     for column in range(row.shape[0]):
         noise = scale[world] * amplitude[column] * (2.0 * wp.randf(random) - 1.0)
         ball = column >= mocap + BALL and column < mocap + HEADING
         captured = column >= mocap and column < mocap + LAUNCHED
-        if not (captured and own_frames == 1) and not (ball and not seen):
+        if captured and column < mocap + HEADING and (cameras.white > 0.0 or cameras.slow > 0.0):
+            noise += scale[world] * (cameras.white * wp.randn(random) + slow[world, column - mocap])
+        if not (captured and lost) and not (ball and not seen):
             row[column] = noise
     for i in range(3):
         row[i] += robot.base_angular_velocity[world][i]
@@ -119,13 +134,16 @@ def _sense(
     if own_frames == 1:
         return
     for column in range(LAUNCHED):
-        if seen or column < BALL or column >= HEADING:
-            row[mocap + column] += _late(line[world], delay[world], column)
-        elif reset == 1:
+        ball = column >= BALL and column < HEADING
+        if seen or (not ball and not lost):
+            row[mocap + column] += _late(line[world], late, column)
+        elif ball and reset == 1:
             row[mocap + column] = 0.0
+    base_new[world] = not lost
+    base_age[world] = wp.where(lost, base_age[world] + control_dt, late * control_dt)
     ball_new[world] = seen
     unseen_for = wp.where(reset == 1, UNSEEN, ball_age[world] + control_dt)
-    ball_age[world] = wp.where(seen, delay[world] * control_dt, unseen_for)
+    ball_age[world] = wp.where(seen, late * control_dt, unseen_for)
 
 
 class Sensing(Stateful):
@@ -136,17 +154,19 @@ class Sensing(Stateful):
     between the control steps around it. A new ball is sensed once the delay has passed since its launch, the old one
     until then; nothing tells them apart. An episode begins as if its ball had been where it is for long. A ball that is
     out of view then is sensed at the origin, in a frame that is ``UNSEEN`` s old, until the first frame shows it.
-    With ``config.mocap.rate`` motion capture has frames of its own instead
-    (:class:`pace.sim.mocap.Mocap`), and both signals keep the newest that has arrived.
+    The frame of a control step may be lost, have a delay of its own, and slowly changing noise (``config.mocap``). With
+    ``config.mocap.rate`` motion capture has frames of its own instead (:class:`pace.sim.mocap.Mocap`). Either way both
+    signals keep the newest frame that has arrived.
 
     Attributes: ``base_angular_velocity`` (N, 3) rad/s body frame, ``projected_gravity`` (N, 3), ``joint_position``
     (N, J) rad from the nominal pose, ``joint_velocity`` (N, J) rad/s, ``base_position`` (N, 3) m,
     ``ball_position`` (N, 3) m, ``heading`` (N, 2), ``base_shift_noise`` (N, 2) m for quantities computed from sensed
-    values; ``ball_age`` (N,) s since the sensed ball's frame was captured, ``ball_new`` (N,) bool, that frame arrived
-    in this step; world frame unless stated.
+    values; ``base_age`` (N,) s since the frame of base position and heading was captured, ``ball_age`` (N,) s since
+    that of the ball was, ``base_new`` and ``ball_new`` (N,) bool, that frame arrived in this step; world frame unless
+    stated.
     """
 
-    STATE = ("_nominal", "_amplitude", "_sensed", "_line", "_delay", "_scale", "ball_age", "ball_new")
+    STATE = ("_nominal", "_amplitude", "_sensed", "_line", "_delay", "_scale", "_slow", *STAMPS)
 
     def __init__(
         self,
@@ -178,13 +198,16 @@ class Sensing(Stateful):
         views = torch.split(self._sensed, list(sizes.values()), dim=1)
         self.base_angular_velocity, self.projected_gravity, self.joint_position, self.joint_velocity = views[:4]
         self.base_position, self.ball_position, self.heading, self.base_shift_noise = views[4:]
-        self.ball_age = torch.zeros(num_worlds, device=device)
+        self.base_age, self.ball_age = torch.zeros(2, num_worlds, device=device)
+        self.base_new = torch.ones(num_worlds, dtype=torch.bool, device=device)
         self.ball_new = torch.ones(num_worlds, dtype=torch.bool, device=device)
-        frames = max(2, math.ceil(self._delays[1]) + 1)
+        frames = max(2, math.ceil(self._delays[1] + config.mocap.jitter[1] / control_dt) + 1)
         self._line = torch.zeros(num_worlds, frames, FRAME_COLUMNS, device=device)
         self._delay = torch.zeros(num_worlds, device=device)  # in control steps
         self._scale = torch.ones(num_worlds, device=device)
         self._seed = torch.zeros(num_worlds, dtype=torch.int32, device=device)
+        self._slow = torch.zeros(num_worlds, HEADING, device=device)  # m, noise of base and ball
+        self._cameras = cameras_of(config.mocap, control_dt)
         self._always = torch.ones(num_worlds, dtype=torch.bool, device=device)  # in view
         self._control_dt = control_dt
         self._mocap = self._make_mocap(config, 6 + 2 * joints) if config.mocap.rate > 0 else None
@@ -193,8 +216,9 @@ class Sensing(Stateful):
     def _make_mocap(self, config: SensingConfig, first: int) -> Mocap:
         """Motion capture with frames of its own, which writes the columns from ``first`` on."""
         columns = slice(first, first + LAUNCHED)
-        own = (self._amplitude[columns], self._sensed[:, columns], self.ball_age, self.ball_new)
-        return Mocap(config, self._control_dt, self._delay, self._scale, *own)
+        own = (self._amplitude[columns], self._sensed[:, columns])
+        stamps = {name: getattr(self, name) for name in STAMPS}
+        return Mocap(config, self._control_dt, self._delay, self._scale, *own, stamps)
 
     def state_tensors(self) -> dict[str, Tensor]:
         """See :class:`pace.arrays.state.Stateful`; those of motion capture where it has frames of its own."""
@@ -227,7 +251,8 @@ class Sensing(Stateful):
         sampled = {"seed": self._seed, "delays": self._delays, "scales": self._scales, "amplitude": self._amplitude}
         truth = {"robot": robot, "ball_position": ball_position, "in_view": in_view, "nominal": self._nominal}
         truth |= {"control_dt": self._control_dt, "own_frames": int(self._mocap is not None)}
-        kept = {"ball_age": self.ball_age, "ball_new": self.ball_new}
+        kept: dict[str, object] = {name: getattr(self, name) for name in STAMPS}
+        kept |= {"cameras": self._cameras, "slow": self._slow}
         kept |= {"delay": self._delay, "scale": self._scale, "line": self._line, "sensed": self._sensed}
         given = sampled | truth | kept
         launches = [[MaskedLaunch(_sense, self._num_worlds, self._device, reset=reset, **given)] for reset in (0, 1)]

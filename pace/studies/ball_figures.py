@@ -92,12 +92,19 @@ def draw_flight_errors(figure: Figure) -> None:
 
 
 @wp.kernel
-def _strike(slip: wp.array[wp.float32], friction: float, velocity: wp.array[wp.vec3], spin: wp.array[wp.vec3]):
-    """Rebound of a ball without spin that comes down at 1 m/s and ``slip`` m/s along x, with e = 0.8."""
+def _strike(
+    slip: wp.array[wp.float32],
+    friction: float,
+    back: float,
+    velocity: wp.array[wp.vec3],
+    spin: wp.array[wp.vec3],
+):
+    """Rebound of a ball without spin at 1 m/s downwards and ``slip`` m/s along x, with e = 0.8, e_t = ``back``."""
     i = wp.tid()
     material = Material()
     material.restitution = 0.8
     material.friction = friction
+    material.tangential = back
     zero = wp.vec3(0.0, 0.0, 0.0)
     after, after_spin = rebound(wp.vec3(slip[i], 0.0, -1.0), zero, wp.vec3(0.0, 0.0, 1.0), zero, 0.02, material)
     velocity[i] = after
@@ -108,18 +115,20 @@ def draw_rebound(figure: Figure) -> None:
     """Share of the tangential speed left after a rebound, and the spin that it gives: kernel (dots) and closed form."""
     slip = np.linspace(0.05, 8.0, 60)
     kept, turned = figure.subplots(1, 2)
-    for friction, colour in zip((0.1, 0.25, 0.38, 0.6), COLOURS, strict=False):
+    surfaces = ((0.1, 0.0), (0.25, 0.0), (0.6, 0.0), (0.6, 0.82), (1.1, 0.82))  # the last: measured rubber
+    for (friction, back), colour in zip(surfaces, COLOURS, strict=False):
         velocity, spin = torch.zeros(2, len(slip), 3)
-        given = {"slip": torch.tensor(slip, dtype=torch.float32), "friction": friction}
+        given = {"slip": torch.tensor(slip, dtype=torch.float32), "friction": friction, "back": back}
         Launch(_strike, len(slip), torch.device("cpu"), velocity=velocity, spin=spin, **given)()
-        loss = np.minimum(0.4 * slip, friction * 1.8)
-        kept.plot(slip, 1 - loss / slip, color=colour, lw=1.5, label=f"μ = {friction}")
+        loss = np.minimum(0.4 * (1.0 + back) * slip, friction * 1.8)
+        kept.plot(slip, 1 - loss / slip, color=colour, lw=1.5, label=f"μ = {friction}, $e_t$ = {back}")
         kept.plot(slip[::4], velocity.numpy()[::4, 0] / slip[::4], "o", color=colour, ms=4)
         turned.plot(slip, 1.5 * loss / 0.02, color=colour, lw=1.5)
         turned.plot(slip[::4], spin.numpy()[::4, 1], "o", color=colour, ms=4)
-    kept.set(xlabel="slip over normal speed, $|u| / |v_n|$", ylabel="share of the tangential speed kept", ylim=(0.5, 1))
+    kept.set(xlabel="slip over normal speed, $|u| / |v_n|$", ylabel="share of the tangential speed kept", ylim=(0, 1))
     kept.legend(frameon=False, loc="lower right")
-    kept.text(0.1, 0.575, "rolls: 3/5", fontsize=8, color="0.3")
+    kept.text(0.1, 0.63, "rolls: 3/5", fontsize=8, color="0.3")
+    kept.text(0.1, 0.21, "springs back: 1 - 2/5 (1 + $e_t$)", fontsize=8, color="0.3")
     turned.set(xlabel="slip over normal speed, $|u| / |v_n|$", ylabel="spin after, at $|v_n|$ = 1 m/s (rad/s)")
 
 

@@ -83,6 +83,22 @@ class FlightModel:
         ball.forecast(self._everyone, ball.position, ball.velocity, ball.spin, self.config.reward.target_x)
         return ball.forecast_result.apex.clone()
 
+    def served(self, cube: Tensor) -> Tensor:
+        """(M,) bool: points (M, D) whose serves are played, since they land as ``serve.attempts`` asks for; all without
+        it."""
+        limits = self.config.serve.limits()
+        if self.config.serve.attempts == 1:
+            return torch.ones(len(cube), dtype=torch.bool)
+        self._launch(cube)
+        ball = self._ball
+        ball.forecast(self._everyone, ball.position, ball.velocity, ball.spin, self.config.reward.target_x)
+        flight = ball.forecast_result
+        limited = {"speed": ball.velocity.norm(dim=1), "bounce_x": flight.bounce[:, 0], "bounce_y": flight.bounce[:, 1]}
+        found = flight.landing_own & ~flight.net_touched
+        for name, (low, high) in limits.items():
+            found &= (limited[name] >= low) & (limited[name] <= high)
+        return found
+
     def _launch(self, cube: Tensor) -> dict[str, Tensor]:
         values, ball = self.prior.values(cube), self._ball
         for name, start in (("position", ball.position), ("velocity", ball.velocity)):

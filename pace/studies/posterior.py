@@ -91,4 +91,4 @@ def _possible(model: FlightModel, question: Question, cube: Tensor, noise: float
     """(M,) bool: points of the prior whose flights are consistent with all sensed positions."""
     off = (model.sensed(cube.clamp(0.0, 1.0), question.sensed.shape[1]) - question.sensed).abs().amax(2)
     explained = ((off <= noise + ROUNDING) | ~question.used).all(1)
-    return explained & ((cube >= 0.0) & (cube <= 1.0)).all(1)
+    return explained & ((cube >= 0.0) & (cube <= 1.0)).all(1) & model.served(cube.clamp(0.0, 1.0))

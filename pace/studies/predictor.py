@@ -27,20 +27,22 @@ CHAINS, STEPS = 4, 900
 SEED = 5
 #: Number of the last sensed positions behind each bound.
 WINDOWS = {"bound, five positions": 5, "bound, whole flight": FRAMES}
-#: Name -> ball preset, randomisation and sensing.
+#: Name -> ball preset, randomisation, sensing and serves.
 CASES = {
-    "rubber": ("rubber", "moderate", "paper"),
-    "paper": ("paper", "moderate", "paper"),
-    "standard": ("standard", "moderate", "paper"),
-    "venue": ("venue", "moderate", "paper"),
-    "all (wide)": ("rubber", "wide", "paper"),
-    "paper, as published": ("paper", "paper", "paper"),
-    "rubber, ball known": ("rubber", "none", "paper"),
-    "rubber, clean": ("rubber", "moderate", "clean"),
-    "paper, clean": ("paper", "moderate", "clean"),
-    "standard, clean": ("standard", "moderate", "clean"),
-    "venue, clean": ("venue", "moderate", "clean"),
-    "rubber, ball known, clean": ("rubber", "none", "clean"),
+    "rubber": ("rubber", "moderate", "paper", "mixed"),
+    "paper": ("paper", "moderate", "paper", "mixed"),
+    "standard": ("standard", "moderate", "paper", "mixed"),
+    "venue": ("venue", "moderate", "paper", "mixed"),
+    "all (wide)": ("rubber", "wide", "paper", "mixed"),
+    "paper, as published": ("paper", "paper", "paper", "mixed"),
+    "rubber, ball known": ("rubber", "none", "paper", "mixed"),
+    "rubber, clean": ("rubber", "moderate", "clean", "mixed"),
+    "paper, clean": ("paper", "moderate", "clean", "mixed"),
+    "standard, clean": ("standard", "moderate", "clean", "mixed"),
+    "venue, clean": ("venue", "moderate", "clean", "mixed"),
+    "rubber, ball known, clean": ("rubber", "none", "clean", "mixed"),
+    "rubber, machine": ("rubber", "moderate", "paper", "machine"),
+    "rubber, machine, ball known": ("rubber", "none", "paper", "machine"),
 }
 SHOWN = ("rubber", "rubber, ball known")
 BEFORE_APEX = BIN_NAMES[1:]
@@ -55,9 +57,9 @@ class Errors:
 
 
 def case_config(case: str, serves: int) -> TrainConfig:
-    """The task of ``CASES[case]`` with the evaluation's mixed serves."""
-    ball, randomization, sensing = CASES[case]
-    overrides = [f"ball={ball}", f"randomization={randomization}", f"sensing={sensing}", "serve=mixed"]
+    """The task of ``CASES[case]``."""
+    ball, randomization, sensing, serve = CASES[case]
+    overrides = [f"ball={ball}", f"randomization={randomization}", f"sensing={sensing}", f"serve={serve}"]
     return parse(compose("predictor_train", [*overrides, f"num_worlds={serves}", f"seed={SEED}"]), TrainConfig)
 
 

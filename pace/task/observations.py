@@ -64,6 +64,7 @@ SENSED: dict[str, ActorObservation] = {
     "joint_velocity": ActorObservation(per_joint, lambda s: s.sensing.joint_velocity),
     "previous_action": ActorObservation(per_joint, lambda s: s.action),
     "ball_position": ActorObservation(3, lambda s: s.sensing.ball_position),
+    "base_age": ActorObservation(1, lambda s: _column(s.sensing.base_age)),
     "heading": ActorObservation(2, lambda s: s.sensing.heading),
     "predicted_apex": ActorObservation(3, lambda s: s.apex),
     "predicted_base_shift": ActorObservation(2, lambda s: s.shift),

@@ -12,11 +12,15 @@ from pace.arrays.draws import Column, UniformSampler, columns_of
 from pace.arrays.graph import may_look
 from pace.arrays.launch import Launch, MaskedLaunch
 from pace.arrays.state import Stateful
+from pace.config.base import ConfigError
 from pace.config.sim import RobotConfig
 from pace.config.task import ResetConfig, ServeConfig
 from pace.sim.ball.ball import BallSim
 from pace.sim.ball.state import BallState, ForecastArrays
 from pace.sim.robot_spec import RobotSpec
+
+#: Rounds in which every world must find a first serve that keeps the limits; with 1 of 20 accepted, 7e-12 do not.
+FIRST_ATTEMPTS = 500
 
 
 @wp.kernel
@@ -86,6 +90,30 @@ def reject(pending: wp.array[wp.bool], forecast: ForecastArrays, velocity: wp.ar
     pending[world] = not (lands and _within(wp.length(velocity[world]), limits.speed))
 
 
+@wp.kernel
+def repeat_good(
+    mask: wp.array[wp.bool],
+    pending: wp.array[wp.bool],
+    launch: wp.array2d[wp.float32],
+    about: wp.array[wp.vec3],
+    good: wp.array2d[wp.float32],
+    good_about: wp.array[wp.vec3],
+):
+    """Keep the masked worlds' serves; those that are ``pending`` get their last good one instead."""
+    world = wp.tid()
+    if not mask[world]:
+        return
+    if pending[world]:
+        about[world] = good_about[world]
+    else:
+        good_about[world] = about[world]
+    for column in range(launch.shape[1]):
+        if pending[world]:
+            launch[world, column] = good[world, column]
+        else:
+            good[world, column] = launch[world, column]
+
+
 def _spinning(about: Tensor, velocity: Tensor, spin: Tensor) -> MaskedLaunch:
     """:func:`spin_of` as a function of a mask."""
     return MaskedLaunch(spin_of, len(about), about.device, about=about, velocity=velocity, spin=spin)
@@ -103,13 +131,16 @@ class ServeSampler(Stateful):
 
     With ``config.attempts`` above 1, serves that do not land well (:class:`pace.config.task.ServeConfig`) are sampled
     again, in that many rounds at most; their forecast overwrites that of ``ball`` in the masked worlds. The rounds are
-    the same launches whatever is found, so that a CUDA graph can hold them; a CPU stops when no world is left.
+    the same launches whatever is found, so that a CUDA graph can hold them; a CPU stops when no world is left. A world
+    that found none in all rounds repeats its last good serve, which has the same distribution.
 
     Attributes: ``launch`` the last samples, as :meth:`sample` returns them; ``about`` (N, 3) rad/s, their topspin,
     sidespin and corkscrew.
+
+    Errors: :class:`ConfigError` for limits that hardly any serve keeps.
     """
 
-    STATE = ("sampled",)
+    STATE = ("sampled", "good", "good_about")
 
     def __init__(self, config: ServeConfig, ball: BallSim, generator: torch.Generator) -> None:
         num_worlds, device = ball.num_worlds, ball.device
@@ -122,10 +153,14 @@ class ServeSampler(Stateful):
         self._spin = _spinning(self.about, *self.launch[1:])
         self._attempts = config.attempts
         self._pending = torch.zeros(num_worlds, dtype=torch.bool, device=device)
+        self.good, self.good_about = torch.zeros_like(launch), torch.zeros_like(self.about)
         if self._attempts > 1:
             self._forecast = ball.forecaster(BallState(*self.launch), 0.0)
             given = {"forecast": ball.forecast_result, "velocity": self.launch[1], "limits": _limits_of(config)}
-            self._reject = Launch(reject, num_worlds, ball.device, pending=self._pending, **given)
+            self._reject = Launch(reject, num_worlds, device, pending=self._pending, **given)
+            rows = {"launch": launch, "about": self.about, "good": self.good, "good_about": self.good_about}
+            self._repeat = MaskedLaunch(repeat_good, num_worlds, device, pending=self._pending, **rows)
+            self._find_good(config)
 
     def sample(self, mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Position m, velocity m/s and spin rad/s, each (N, 3), world frame: new in the worlds of ``mask`` (N,) bool.
@@ -137,17 +172,40 @@ class ServeSampler(Stateful):
             return self.launch
         self._pending.copy_(mask)
         for _ in range(self._attempts):
-            self._try(self._pending)
-            self._forecast(self._pending)
-            self._reject()
+            self._attempt()
             if may_look(self._pending) and not bool(self._pending.any()):
                 break
+        self._repeat(mask)
+        self._forecast(self._pending)  # of the ball that the world has now
+        self._reject()
         return self.launch
 
     @property
     def accepted(self) -> Tensor:
         """(N,) bool, the worlds whose last sample landed well; with one attempt nobody looks."""
         return ~self._pending
+
+    def _find_good(self, config: ServeConfig) -> None:
+        """A first good serve for every world."""
+        everyone = torch.ones_like(self._pending)
+        self._pending.copy_(everyone)
+        for _ in range(FIRST_ATTEMPTS):
+            self._attempt()
+            if not bool(self._pending.any()):
+                return self._repeat(everyone)
+        limits = ", ".join(f"serve.{name}={limit}" for name, limit in config.limits().items())
+        left = int(self._pending.sum())
+        raise ConfigError(
+            f"serve={config.name}: {left} of {len(everyone)} worlds found no serve that lands on the robot's half "
+            f"and keeps {limits or 'off the net'} in {FIRST_ATTEMPTS} attempts: widen these, or narrow the ranges of "
+            "position and velocity"
+        )
+
+    def _attempt(self) -> None:
+        """Sample the pending worlds' serves, and leave those pending whose serve does not land well."""
+        self._try(self._pending)
+        self._forecast(self._pending)
+        self._reject()
 
     def _try(self, mask: Tensor) -> None:
         self._sample(mask)

@@ -8,7 +8,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from pace.config.base import ConfigError, parse
+from pace.config.base import ConfigError, compose, parse
 from pace.config.commands import PlayConfig
 from pace.evaluation.sweep import ball_presets
 from pace.rl.policies import TaskPolicy, load_policy
@@ -74,6 +74,16 @@ def film(config: PlayConfig, show: Shown, about: str) -> None:
     with tqdm(total=total, desc=file.name, unit="picture", mininterval=interval) as bar:
         write_video(file, show, config.seconds, config.fps, config.speed, *size, on_picture=lambda: _tick(bar))
     print(f"{about}\n{show.text()}\nwrote {file}")
+
+
+def film_run(run: Path, file: Path, seconds: float) -> None:
+    """Write a video of a run's newest policy, as ``pace play`` does if nothing else is asked.
+
+    Errors: :class:`pace.sim.render.RenderError` if OpenGL or a package is missing, or the file cannot be written.
+    """
+    usual = parse(compose("play", [f"run='{run}'", f"video='{file}'", f"seconds={seconds}"]), PlayConfig)
+    show = Show(load_policy(run), [f"engine.physics_dt={usual.physics_dt}"], usual.seed)
+    write_video(file, show, seconds, usual.fps, usual.speed, usual.width, usual.height)
 
 
 def _tick(bar: tqdm) -> None:

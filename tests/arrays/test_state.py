@@ -28,8 +28,8 @@ STATE = {
     "game.target": "apex apex_time arriving idle_point playable point something_to_hit time",
     "policy": "frame observation",
     "rewards": "_weights reward sums values",
-    "serves": "sampled",
-    "sensing": "_amplitude _delay _line _nominal _scale _sensed ball_age ball_new",
+    "serves": "good good_about sampled",
+    "sensing": "_amplitude _delay _line _nominal _scale _sensed _slow ball_age ball_new base_age base_new",
     "state": (
         "action apex arrival base_error feet_distance foot_contact foot_load lost mocap_delay nominal "
         "previous_action shift something_to_hit target"

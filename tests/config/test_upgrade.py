@@ -155,7 +155,7 @@ def test_a_state_of_format_2_gets_what_the_true_world_keeps() -> None:
 
 
 def test_a_state_of_format_4_gets_the_count_of_the_free_hand() -> None:
-    saved = {"statistics.sums": torch.arange(18.0)}
+    saved = old_env() | {"statistics.sums": torch.arange(18.0), "serves.sampled": torch.rand(3, 9)}
     env = upgrade_state({"processes": [{"env": saved}]}, 4)["processes"][0]["env"]
     counts = dict(zip(NAMES, env["statistics.sums"].tolist(), strict=True))
     assert (counts["outcome/table_touch"], counts["outcome/free_hand"]) == (17.0, 0.0)
@@ -192,3 +192,20 @@ def test_an_old_checkpoint_is_upgraded_wherever_it_is_read(tmp_path: Path) -> No
     (folder / META).write_text(json.dumps(meta))
     assert load_checkpoint(tmp_path).config["out"] == "runs/old"
     check_settings(Run(tmp_path, ("robot=t1_paper",), 100.0))  # the same settings, but for the folder
+
+
+def test_a_state_of_format_5_gets_the_stamps_of_the_base_and_a_good_serve() -> None:
+    worlds = {"sensing._delay": torch.tensor([0.5, 1.0]), "game.ends.over": torch.zeros(2, dtype=torch.bool)}
+    worlds["serves.sampled"] = torch.rand(2, 9)
+    filmed = worlds | {"sensing.mocap._base_age": torch.tensor([0.03, 0.09])}
+    envs = [
+        process["env"] for process in upgrade_state({"processes": [{"env": worlds}, {"env": filmed}]}, 5)["processes"]
+    ]
+    assert [env["sensing.base_age"].tolist() for env in envs] == [
+        pytest.approx([0.01, 0.02]),
+        pytest.approx([0.03, 0.09]),
+    ]
+    assert all(env["sensing.base_new"].all() for env in envs)
+    assert "sensing.mocap._base_age" not in envs[1]
+    assert torch.equal(envs[0]["serves.good"], worlds["serves.sampled"])
+    assert envs[0]["serves.good_about"].shape == (2, 3)

@@ -310,7 +310,7 @@ def test_the_example_refuses_files_of_other_versions(
     model = onnx.load(str(exported[0]))
     onnx.helper.set_model_props(model, {"format": "1"})
     onnx.save(model, str(tmp_path / "old.onnx"))
-    with pytest.raises(ValueError, match="format 1, not 4: export it again"):
+    with pytest.raises(ValueError, match="format 1, not 5: export it again"):
         example.Controller(tmp_path / "old.onnx")
 
 

@@ -92,8 +92,8 @@ def test_one_from_outside_is_exported(registered: TrainConfig) -> None:
     policy = TaskPolicy(registered, network.eval(), PredictorNetwork(registered.predictor), "fresh")
     graph = DeployedPolicy(policy, build_model(registered.robot, registered.engine, registered.ball.table))
     state = StateLayout(registered)
-    readings = [torch.rand(2, size) for size in (3, 3, 3, 2, 21, 21, 3, 1)]
-    readings.append(torch.ones(2, 1))  # a new frame of the ball
+    readings = [torch.rand(2, size) for size in (3, 3, 3, 2, 21, 21, 3)]
+    readings += [torch.rand(2, 1), torch.ones(2, 1)] * 2  # new frames of the base and of the ball
     with torch.no_grad():
         first = graph(*readings, torch.zeros(2, state.size))[-1]
         assert torch.equal(first[:, state.columns["mean"]], readings[6])

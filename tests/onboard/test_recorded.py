@@ -19,6 +19,7 @@ from pace.onboard.actor import Readings
 from pace.onboard.kinematics import PaddleChain
 from pace.rl.policies import load_policy
 from pace.sim.robot import build_model
+from pace.sim.sensing import STAMPS
 from pace.task.signals import ActorSignals
 from tests.helpers.fakes import config
 from tests.helpers.robot import SPEC
@@ -42,10 +43,11 @@ class Recording:
         with np.load(DATA / f"{name}.npz") as file:
             self.values = {key: torch.from_numpy(file[key]) for key in file.files}
         self.event = 0
-        names = [name for name in (*Readings._fields, "base_shift_noise") if name not in ("ball_age", "ball_new")]
+        names = [name for name in (*Readings._fields, "base_shift_noise") if name not in STAMPS]
         self.sensing = SimpleNamespace(**{name: self.now(f"reading.{name}").clone() for name in names})
         worlds = len(self.now("mask"))  # that commit had a frame in each step, of no known age
-        self.sensing.ball_age, self.sensing.ball_new = torch.zeros(worlds), torch.ones(worlds, dtype=torch.bool)
+        self.sensing.base_age = self.sensing.ball_age = torch.zeros(worlds)
+        self.sensing.base_new = self.sensing.ball_new = torch.ones(worlds, dtype=torch.bool)
         self.action = self.now("reading.action").clone()
 
     def __len__(self) -> int:
@@ -63,7 +65,7 @@ class Recording:
         self.event = event
         self.action.copy_(self.now("reading.action"))
         for name, value in vars(self.sensing).items():
-            if name not in ("ball_age", "ball_new"):
+            if name not in STAMPS:
                 value.copy_(self.now(f"reading.{name}"))
 
     def expected(self, name: str) -> Tensor:

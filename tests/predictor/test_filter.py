@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
 
 from pace.config.base import ConfigError, compose, parse
-from pace.config.predictor import PredictorPriors
+from pace.config.predictor import FlightFit, PredictorPriors
 from pace.config.training import TrainConfig, load_train_config
-from pace.predictor.filter import CONTACT_HEIGHT, FlightFilter, rebound, solve
+from pace.predictor.filter import FlightFilter, rebound, solve
 from pace.predictor.network import PredictorNetwork
 from pace.rl.practice import ServePractice
 
 WINDOW = 45
-PRIORS = PredictorPriors()
+PRIORS, FIT = PredictorPriors(), FlightFit()
 DT = 0.02  # s
 
 
@@ -24,10 +26,10 @@ def flights(count: int, frames: int) -> tuple[Tensor, Tensor, Tensor]:
     start = torch.tensor([1.35, 0.0, 1.03]).expand(count, 3)
     velocity = torch.tensor([-5.75, -0.2, 1.75]) + 0.2 * (torch.rand(count, 3, generator=generator) - 0.5)
     fall, rise = torch.tensor(PRIORS.fall.mean), torch.tensor(PRIORS.rise.mean)
-    drop = velocity[:, 2:].square() - 2 * fall[2] * (start[:, 2:] - CONTACT_HEIGHT)
+    drop = velocity[:, 2:].square() - 2 * fall[2] * (start[:, 2:] - FIT.contact_height)
     bounce = (-velocity[:, 2:] - drop.sqrt()) / fall[2]
     place = start + bounce * velocity + 0.5 * bounce**2 * fall
-    after = rebound(velocity + bounce * fall)
+    after = rebound(velocity + bounce * fall, FIT)
     time = DT * torch.arange(frames).view(1, -1, 1)
     late = time - bounce.unsqueeze(1)
     ahead = start.unsqueeze(1) + time * velocity.unsqueeze(1) + 0.5 * time**2 * fall
@@ -41,7 +43,7 @@ def flights(count: int, frames: int) -> tuple[Tensor, Tensor, Tensor]:
 @pytest.mark.parametrize("frames", [6, 15, 21, 27, 33])
 def test_it_is_exact_on_its_own_flights(frames: int) -> None:
     window, bounce, apex = flights(50, frames)
-    found = FlightFilter(WINDOW, PRIORS)(window)
+    found = FlightFilter(WINDOW, PRIORS, FIT)(window)
     torch.testing.assert_close(found.age, torch.full((50, 1), DT * (frames - 1)))
     torch.testing.assert_close(DT * (frames - 1) - found.bounce_age[:, 0], bounce, atol=2e-3, rtol=0)
     early = 0.06 if frames < 10 else 0.005  # few frames leave the priors' means of the velocity
@@ -64,7 +66,7 @@ def practice(*overrides: str) -> ServePractice:
 def test_it_finds_bounce_and_apex_of_the_tasks_flights() -> None:
     """Under the paper's noise and delay: the bounce within 3 ms, the apex within 4.5 cm before any learning."""
     serves = practice("randomization=none", "ball=paper")
-    flight_filter, bounced_at = FlightFilter(WINDOW, PRIORS), torch.full((256,), torch.nan)
+    flight_filter, bounced_at = FlightFilter(WINDOW, PRIORS, FIT), torch.full((256,), torch.nan)
     for step in range(1, 35):
         serves.advance()
         bounce = serves.ball.events.own_bounce > 0
@@ -106,3 +108,16 @@ def test_untrained_it_predicts_the_apex_that_was_fitted() -> None:
 def test_unknown_features_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"predictor\.features"):
         load_train_config(["predictor.features=fourier"])
+
+
+def test_the_numbers_of_the_fit_are_configuration() -> None:
+    """The YAML holds those of saved predictors, and a duller table is expected to give a lower apex."""
+    assert load_train_config(["predictor=filter"]).predictor.fit == FIT
+    window = flights(20, 15)[0]  # 0.28 s: before the bounce
+    apex = FlightFilter(WINDOW, PRIORS, FIT)(window).apex
+    dull = FlightFilter(WINDOW, PRIORS, replace(FIT, restitution=0.8))(window).apex
+    # v_z^2 / (2 g) with v_z = e |v|: (0.8 / 0.92)^2 of the rise above the table
+    ratio = (dull[:, 2] - FIT.contact_height) / (apex[:, 2] - FIT.contact_height)
+    torch.testing.assert_close(ratio, torch.full((20,), (0.8 / 0.92) ** 2), atol=0.02, rtol=0)
+    with pytest.raises(ConfigError, match=r"predictor\.fit\.bounce_width needs 3 numbers, got 2"):
+        load_train_config(["predictor.fit.bounce_width=[0.1,0.1]"])

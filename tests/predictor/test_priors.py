@@ -7,7 +7,7 @@ import torch
 
 from pace.config.base import to_dict
 from pace.config.overrides import override_task
-from pace.config.predictor import PredictorPriors
+from pace.config.predictor import FlightFit, PredictorPriors
 from pace.config.training import TrainConfig, load_train_config
 from pace.config.upgrade import upgrade_config
 from pace.predictor.network import make_predictor
@@ -19,13 +19,13 @@ SLOW = ["serve.vx=[-4.6,-4.2]", "serve.vz=[2.3,2.5]"]
 
 
 def test_for_the_serves_they_were_measured_on_they_are_the_measured_ones_to_the_last_digit() -> None:
-    assert derive_priors(MEASURED_ON) == PredictorPriors()
+    assert derive_priors(MEASURED_ON, FlightFit()) == PredictorPriors()
     assert Launches.of(load_train_config()) == MEASURED_ON
     assert resolve_priors(load_train_config()).priors == PredictorPriors()
 
 
 def test_they_move_with_the_serves_and_the_target() -> None:
-    priors = derive_priors(Launches.of(load_train_config([*SLOW, "reward.target_x=-1.8"])))
+    priors = derive_priors(Launches.of(load_train_config([*SLOW, "reward.target_x=-1.8"])), FlightFit())
     assert priors.launch_velocity.mean == pytest.approx([-4.4, -0.2, 2.4])
     assert priors.target.mean[0] == pytest.approx(-1.8)
     assert priors.launch_velocity.std[0] == pytest.approx(0.3)  # no less than half of what was measured
@@ -35,7 +35,7 @@ def test_they_move_with_the_serves_and_the_target() -> None:
 
 def test_for_serves_with_limits_they_are_those_of_the_balls_that_are_accepted() -> None:
     config = load_train_config(["serve=machine", "num_worlds=1024"])
-    priors, practice = derive_priors(Launches.of(config)), flown(config)
+    priors, practice = derive_priors(Launches.of(config), config.predictor.fit), flown(config)
     for name in ("apex", "launch_velocity", "bounce", "target", "target_time"):
         prior = getattr(priors, name)
         assert torch.tensor([*prior.mean, *prior.std]).isfinite().all()
@@ -56,7 +56,7 @@ def flown(config: TrainConfig) -> ServePractice:
 
 def test_the_derived_priors_are_where_the_balls_are() -> None:
     config = load_train_config([*SLOW, "num_worlds=256", "predictor=filter"])
-    priors, practice = derive_priors(Launches.of(config)), flown(config)
+    priors, practice = derive_priors(Launches.of(config), config.predictor.fit), flown(config)
     apex = practice.predictor_target[practice.predictor_valid][:, :3]
     away = [abs(float(apex.mean(0)[0]) - known.apex.mean[0]) for known in (priors, PredictorPriors())]
     assert away[0] < 0.1 < away[1]

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import signal
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
+from pace.config.judge import JudgeConfig
 from pace.rl.policies import load_policy
+from pace.rl.session import close
 from pace.rl.train import main
-from pace.rl.trainer import Trainer
+from pace.rl.trainer import Summary, Trainer
 from pace.runs.checkpoint import load_checkpoint
 from pace.runs.metrics import read_metrics
 from tests.helpers.algo import IN_SAMPLES
@@ -62,6 +66,42 @@ def test_real_updates_and_an_exact_resume(train, tmp_path: Path, capsys: pytest.
     rewards = [read_metrics(tmp_path / run / "metrics.csv")["mean_reward"] for run in ("whole", "parts")]
     assert rewards[0] == rewards[1]
     assert len(set(rewards[0])) == 4
+
+
+@pytest.mark.slow
+def test_a_run_closes_with_what_the_policy_does_without_exploration(
+    train, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    few = [f"judge.{name}=4" for name in ("serves", "worlds", "last_serves", "last_worlds")]
+    few += ["judge.after=0", "judge.physics_dt=0.01", "judge.warmup_serves=0", "judge.video=0.2"]
+    assert real_run(train, tmp_path, 3, "checkpoint_minutes=0", *few) == 0
+    printed = capsys.readouterr().out
+    assert "4 mixed serves" in printed
+    assert "the paper" in printed
+    assert f"wrote {tmp_path / 'play.mp4'}" in printed or "no video: " in printed
+    assert f"next: pace play {tmp_path} | pace evaluate {tmp_path} | pace export {tmp_path}" in printed
+    assert (tmp_path / "evaluation" / "evaluation.json").is_file()
+    judged = read_metrics(tmp_path / "metrics.csv")["eval_hit"]
+    assert math.isnan(judged[0])
+    assert all(0.0 <= share <= 1.0 for share in judged[1:])
+
+
+def test_ctrl_c_leaves_the_judgement_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    class Slow:
+        def quick(self, checkpoint: Path, minutes: float) -> dict[str, float]:
+            raise AssertionError(checkpoint, minutes)
+
+        def last(self, run: Path, minutes: float) -> None:
+            raise KeyboardInterrupt(run, minutes)
+
+    def film(run: Path, seconds: float) -> None:
+        raise AssertionError(run, seconds)
+
+    summary = Summary("done", 3, 100, 90.0, tmp_path / "checkpoints" / "update_00000003", None, {}, [])
+    close(Slow(), film, summary, JudgeConfig())
+    assert "left out; the run is complete" in capsys.readouterr().out
+    close(Slow(), film, replace(summary, seconds=59.0), JudgeConfig())  # a run of less than a minute
+    assert capsys.readouterr().out == ""
 
 
 def test_init_from_starts_a_new_run_with_the_weights(train, tmp_path: Path) -> None:

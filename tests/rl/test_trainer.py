@@ -24,9 +24,11 @@ from pace.rl.trainer import Trainer
 from pace.runs.checkpoint import CheckpointError, load_checkpoint
 from pace.runs.checkpoint_folders import list_checkpoints
 from pace.runs.metrics import read_metrics
+from pace.runs.optimiser import learning_rate
 from pace.runs.run_folder import RunFolder
 from tests.helpers.algo import IN_SAMPLES
 from tests.helpers.dummy import DummyTask
+from tests.helpers.training import assert_same, dummy_trainer
 
 WORLDS = 64
 UPDATE = WORLDS * 12
@@ -308,3 +310,48 @@ def test_a_run_folder_has_one_owner(tmp_path: Path) -> None:
     first.close()
     assert read_metrics(tmp_path / "metrics.csv")["update"] == [1.0, 2.0]  # the second has touched nothing
     RunFolder(tmp_path, {}, False, 2).close()
+
+
+def test_a_run_that_starts_from_weights_begins_with_steps_that_their_std_allows(tmp_path: Path) -> None:
+    """Adam's first steps are as large as the learning rate, and at a tenth of the std their KL a hundred times."""
+    for std, rate in ((0.1, 1e-5), (0.5, 2.5e-4), (1.0, 1e-3)):
+        old, new = (dummy_trainer(tmp_path / f"{part}_{std}", 3) for part in ("old", "new"))
+        learner(old).agent.actor.bound_std(0.05, std)
+        new.start_from(old.checkpoint())
+        assert learning_rate(learner(new).ppo.actor_optimiser).item() == pytest.approx(rate)
+        assert learning_rate(learner(new).ppo.critic_optimiser).item() == pytest.approx(1e-3)
+        said = f"the actor's learning rate at {rate:.2g} first, as a std of {std:.2g} allows"
+        assert (said in learner(new).describe()) == (std < 1.0)
+
+
+class Watching:
+    """A judge that gives numbers of its own."""
+
+    def __init__(self) -> None:
+        self.seen: list[Path] = []
+
+    def quick(self, checkpoint: Path, minutes: float) -> dict[str, float]:
+        """Random numbers of its own would be another judge's business: this one takes none."""
+        assert minutes >= 0.0
+        assert (checkpoint / "weights.safetensors").exists()
+        self.seen.append(checkpoint)
+        return {"eval_hit": 0.25 * len(self.seen), "eval_success": 0.5}
+
+    def last(self, run: Path, minutes: float) -> None:
+        """Whoever made the trainer asks for it."""
+        raise AssertionError(f"{run} after {minutes}")
+
+
+def test_a_judgement_follows_each_checkpoint_and_is_in_the_next_row(tmp_path: Path) -> None:
+    judged = dummy_trainer(tmp_path / "judged", 4)
+    judged.judge = judge = Watching()
+    judged.train()
+    dummy_trainer(tmp_path / "alone", 4).train()
+    assert len(judge.seen) == 3  # the last checkpoint is left to the judgement at the end
+    found = read_metrics(tmp_path / "judged" / "metrics.csv")
+    assert found["eval_hit"][1:] == [0.25, 0.5, 0.75]
+    assert math.isnan(found["eval_hit"][0])
+    assert all(map(math.isnan, read_metrics(tmp_path / "alone" / "metrics.csv")["eval_success"]))
+    one, other = load_checkpoint(tmp_path / "judged"), load_checkpoint(tmp_path / "alone")
+    assert_same(one.weights, other.weights)
+    assert_same(one.training, other.training)

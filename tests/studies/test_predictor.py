@@ -24,7 +24,7 @@ def config(case: str, serves: int, noise: float | None = None) -> TrainConfig:
     return config
 
 
-@pytest.mark.parametrize("case", ["rubber", "all (wide)", "paper, clean"])
+@pytest.mark.parametrize("case", ["rubber", "all (wide)", "paper, clean", "rubber, machine"])
 def test_the_model_senses_what_the_task_senses(case: str) -> None:
     task = config(case, 32, noise=0.0)
     recording = record(task, FRAMES)
@@ -40,6 +40,19 @@ def test_noise_stays_within_what_the_bound_takes_for_possible() -> None:
     recording = record(task, FRAMES)
     off = (FlightModel(task, 64).sensed(recording.cube, FRAMES) - recording.sensed).abs()[recording.valid]
     assert 0.0069 < off.max().item() < 0.00702
+
+
+def test_the_prior_of_a_machine_is_that_of_the_balls_it_serves() -> None:
+    task = config("rubber, machine", 2000)
+    model, recording = FlightModel(task, 2000), record(task, 1)
+    assert bool(model.served(recording.cube).all())
+    anywhere = torch.rand(recording.cube.shape, generator=torch.Generator().manual_seed(1))
+    assert model.served(anywhere).float().mean().item() == pytest.approx(0.4, abs=0.04)
+    used = torch.zeros(16, 1, dtype=torch.bool)  # nothing was seen
+    known = Question(recording.cube[:16], recording.sensed[:16], used)
+    few = config("rubber, machine", 16)
+    spread = recording.apex.var(0).sum().sqrt().item()
+    assert answer(few, known, chains=4, steps=200).std.mean().item() == pytest.approx(spread, rel=0.15)
 
 
 def test_the_cube_holds_the_whole_prior() -> None:
