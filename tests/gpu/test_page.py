@@ -29,6 +29,8 @@ from tests.helpers.gpu import Sizes, captured, curve, difference_table, environm
 pytestmark = pytest.mark.gpu
 ROOT = Path(__file__).parents[2]
 Page = Callable[[str, str], None]
+#: The page evaluates by itself.
+UNJUDGED = ("judge.serves=0", "judge.last_serves=0", "judge.video=0")
 #: Of an evaluation: what the page does not show.
 PLAIN = ("progress=false", "first_ball=[]", "task=own", "physics_dt=0.01")
 
@@ -79,7 +81,7 @@ def test_two_runs_of_one_seed(device: torch.device, sizes: Sizes, page: Page, fi
 def test_killed_and_resumed(device: torch.device, sizes: Sizes, page: Page, tmp_path: Path) -> None:
     run = tmp_path / "run"
     line = [sys.executable, "-m", "pace.rl.train", f"out={run}", f"device={device}", "progress=false", "minutes=0",
-            "samples=inf", "tensorboard=false", "processes=1", *sizes.killed]  # fmt: skip
+            "samples=inf", "tensorboard=false", "processes=1", *UNJUDGED, *sizes.killed]  # fmt: skip
     with (tmp_path / "said").open("w") as said:
         process = subprocess.Popen(line, env=os.environ | {"PYTHONPATH": str(ROOT)}, stdout=said, stderr=said)
         while process.poll() is None and len(list_checkpoints(run)) < 2:
