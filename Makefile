@@ -7,7 +7,7 @@ ARGS ?=
 WORKERS ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help train test test-fast test-long lint bench venv lock clean
+.PHONY: help train test test-fast test-long gpu lint bench venv lock clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## ?/\1\t/' | expand -t 12
@@ -23,6 +23,9 @@ test-fast: venv  ## leave out the end-to-end runs
 
 test-long: venv  ## what takes many minutes: wheels, kills, compilations
 	$(BIN)/python -m pytest -m long $(ARGS)
+
+gpu: venv  ## what only a GPU can show, as one page: pytest -m gpu -s tests/gpu $(ARGS)
+	$(BIN)/python -m pytest -m gpu -s tests/gpu $(ARGS)
 
 lint: venv  ## ruff and pyright
 	$(BIN)/ruff check .

@@ -85,7 +85,7 @@ def watched() -> Iterator[None]:
     """Within it, what waits without an operator of torch, and modules of Warp that are loaded only now, raise
     :class:`DryRunError`."""
     refused = [(owner, name, _refuse(f"{owner.__name__}.{name}")) for owner, names in REFUSED for name in names]
-    with replaced(*refused, (context.Module, "load", _load_nothing(context.Module.load))):
+    with replaced(*refused), loads_refused():
         yield
 
 
@@ -96,12 +96,27 @@ def _refuse(name: str) -> Callable[..., NoReturn]:
     return refuse
 
 
-def _load_nothing(load: Any) -> Any:
-    def checked(module: Any, *args: Any, **kwargs: Any) -> Any:
-        known = list(module.execs.values())
-        found = load(module, *args, **kwargs)
-        if not any(found is each for each in known):
-            raise DryRunError(f"{place()}: Warp's module {module.name} is loaded in a call that a graph would hold")
+@contextmanager
+def loads_refused() -> Iterator[None]:
+    """Within it a launch of a kernel whose module is not loaded yet, or no longer, raises :class:`DryRunError` that
+    names the kernel. Warp would load it, which a capture does not survive."""
+    launched, load = ["?"], context.Module.load
+
+    def named(launch: Any) -> Any:
+        def launching(kernel: Any, *args: Any, **kwargs: Any) -> Any:
+            launched[0] = kernel.key
+            return launch(kernel, *args, **kwargs)
+
+        return launching
+
+    def checked(module: Any, device: Any, block_dim: int | None = None, *args: Any, **kwargs: Any) -> Any:
+        known = module.execs.get((wp.get_device(device).context, block_dim or module.options["block_dim"]))
+        found = None if known is None else load(module, device, block_dim, *args, **kwargs)
+        if found is None or found is not known:
+            where = f"{place()}: kernel '{launched[0]}' is used for the first time, or was unloaded"
+            raise DryRunError(f"{where}: Warp's module {module.name} is loaded in a call that a graph would hold")
         return found
 
-    return checked
+    launches = [(owner, "launch", named(owner.launch)) for owner in (wp, context)]
+    with replaced(*launches, (context.Module, "load", checked)):
+        yield

@@ -120,9 +120,20 @@ def _run_hydra(command: Command) -> int:
             if error.errno not in DISK:
                 raise
             status = complain(": ".join(filter(None, (error.filename, error.strerror))), EXIT_FAILED)
+        except RuntimeError as error:
+            status = complain(_full_memory(error), EXIT_FAILED)
 
     hydra.main(config_path=str(config_dir()), config_name=command.config, version_base="1.3")(guarded)()
     return status
+
+
+def _full_memory(error: RuntimeError) -> str:
+    """The line for a GPU whose memory is full. Errors: ``error`` itself if it is another one."""
+    from pace.devices import full_memory_in_words, out_of_memory  # imports torch, as the work has done
+
+    if not out_of_memory(error):
+        raise error
+    return full_memory_in_words()
 
 
 def _given_folders() -> list[Path]:

@@ -92,6 +92,12 @@ def _values(given: DeviceValues, machine: Machine) -> dict[str, Any]:
     return values
 
 
+def most_worlds(memory: float) -> int:
+    """Estimate of the worlds of a training run that fit into a GPU's ``memory`` (GiB), a multiple of 256."""
+    given = _given(Machine("cuda"))
+    return max(int((SHARE_OF_MEMORY * memory - given.memory) / given.memory_per_world), 0) // 256 * 256
+
+
 def _worlds_that_fit(given: DeviceValues, memory: float) -> int:
     """The number of worlds, halved until a run of them fits into the memory."""
     worlds = given.num_worlds

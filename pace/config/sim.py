@@ -199,6 +199,8 @@ class EngineConfig:
     # of CUDA for steps and updates on a GPU, of Warp for mjwarp on a CPU: auto, always, never; or dry, which goes a
     # GPU's way on a CPU and names what a graph could not hold
     graph: str = "auto"
+    # mjwarp on a GPU: contacts, constraints and sums in a fixed order (MuJoCo Warp's own switch), for a price
+    deterministic: bool = field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
         known = self.name in ("auto", "native", "mjwarp") or plugins.may_be_outside(plugins.ENGINES, self.name)

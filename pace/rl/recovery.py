@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from pace.config.base import to_dict
 from pace.config.training import TrainConfig
+from pace.devices import full_memory_in_words, out_of_memory
 from pace.distributed import ProcessGroup
 from pace.rl.rollout import RolloutError, TrainableTask
 from pace.runs.checkpoint import Checkpoint, CheckpointError, save_checkpoint
@@ -105,8 +106,8 @@ class Recovery:
     def attempt(self, update: Callable[[], Row], env: TrainableTask, counters: dict[str, float]) -> Row | None:
         """The row of an update after ``counters``; None if it is skipped: it was not finite, and is undone.
 
-        Errors: :class:`RolloutError` for one more than ``algo.skips`` in a row. The weights before them are then saved
-        beside the checkpoints.
+        Errors: :class:`RolloutError` for one more than ``algo.skips`` in a row, and for a GPU whose memory is full. The
+        weights before them are then saved beside the checkpoints.
         """
         self._good.keep()
         self._good_at = counters if self.in_a_row == 0 else self._good_at
@@ -123,6 +124,11 @@ class Recovery:
             if self._run is not None:
                 say(f"warning: update {number} is skipped: {error}")
             return None
+        except RuntimeError as error:
+            if not out_of_memory(error) or number == 1:
+                raise
+            torch.cuda.empty_cache()
+            raise self._last_words(RolloutError(full_memory_in_words())) from error
         self.in_a_row = 0
         if row.get("diverged", 0.0) > 0:
             self._write_replay(env, number, "diverged")

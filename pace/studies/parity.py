@@ -120,19 +120,21 @@ def counting_all(model: mujoco.MjModel) -> mujoco.MjModel:
     return model
 
 
-def play(engine: str, nudge: float, scenario: Scenario, balls: Balls) -> Play:
-    """Roll out a scenario. ``balls``: the throws; the first rollout, which finds it empty, aims and fills it."""
+def play(engine: str, nudge: float, scenario: Scenario, balls: Balls, device: str = "cpu") -> Play:
+    """Roll out a scenario. ``balls``: the throws; the first rollout, which finds it empty, aims and fills it, on a
+    CPU."""
     config = study_config(name=engine, cone=scenario.cone)
     count = scenario.velocity.shape[0]
-    everyone = torch.ones(count, dtype=torch.bool)
+    everyone = torch.ones(count, dtype=torch.bool, device=device)
     model = counting_all(model_of(config))
     if not scenario.convex:
         model = limbs_only(model)
-    worlds = Worlds(config, count, "cpu", model=model)
+    worlds = Worlds(config, count, device, model=model)
     qpos = standing(config, count)
     qpos[:, 7:] += nudge
-    worlds.reset_robot(everyone, qpos, scenario.velocity)
-    worlds.serve(everyone, torch.full((count, 3), 50.0), torch.zeros(count, 3), torch.zeros(count, 3))
+    still, away = torch.zeros(count, 3, device=device), torch.full((count, 3), 50.0, device=device)
+    worlds.reset_robot(everyone, qpos.to(device), scenario.velocity.to(device))
+    worlds.serve(everyone, away, still, still)
     aims, seen = iter(balls), []
     first = not balls
     for step, targets in enumerate(scenario.targets):
@@ -140,8 +142,8 @@ def play(engine: str, nudge: float, scenario: Scenario, balls: Balls) -> Play:
             if first:
                 balls.append(throw(worlds, torch.full((count,), 8.0)))
             position, velocity = balls[-1] if first else next(aims)
-            worlds.serve(everyone, position, velocity, torch.zeros(count, 3))
-        worlds.step(targets)
+            worlds.serve(everyone, position.to(device), velocity.to(device), still)
+        worlds.step(targets.to(device))
         seen.append(_look(worlds))
     return Play(*(np.stack(part) for part in zip(*seen, strict=True)))
 
@@ -153,7 +155,7 @@ def _look(worlds: Worlds) -> tuple[Array, ...]:
     convex = [study_spec().contacts.index(body) for body in CONVEX_BODIES]
     touched = robot.body_contact[:, convex].amax(1)
     parts = (robot.joint_position, base, robot.foot_force[..., 2], paddle, worlds.ball.velocity, touched)
-    return tuple(part.double().numpy().copy() for part in parts)
+    return tuple(part.double().cpu().numpy().copy() for part in parts)
 
 
 def difference(one: Play, other: Play) -> Difference:
@@ -170,15 +172,16 @@ def difference(one: Play, other: Play) -> Difference:
     )
 
 
-def compare(num_worlds: int) -> dict[str, dict[str, Difference]]:
-    """For each scenario, the difference of each of OTHERS from ``native``."""
+def compare(num_worlds: int, device: str = "cpu") -> dict[str, dict[str, Difference]]:
+    """For each scenario, the difference of each of OTHERS from ``native``; ``device``: that of ``mjwarp``."""
     nominal = Worlds(study_config(), 1, "cpu").nominal
     found: dict[str, dict[str, Difference]] = {}
     for name, scenario in scenarios(num_worlds, nominal).items():
         balls: Balls = []
         native = play("native", 0.0, scenario, balls)
         found[name] = {
-            other: difference(play(engine, nudge, scenario, balls), native) for other, (engine, nudge) in OTHERS.items()
+            other: difference(play(engine, nudge, scenario, balls, device if engine == "mjwarp" else "cpu"), native)
+            for other, (engine, nudge) in OTHERS.items()
         }
     return found
 

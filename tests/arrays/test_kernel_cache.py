@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from subprocess import Popen
 
 import pytest
 
@@ -27,6 +28,13 @@ def _double(values: wp.array[wp.float32]):
 values = wp.full(2, 3.0, dtype=wp.float32, device="cpu")
 wp.launch(_double, 2, [values], device="cpu")
 print(values.numpy().tolist(), wp.config.kernel_cache_dir)
+"""
+#: Waits until both jobs have come this far.
+BARRIER = """
+import pathlib, sys, time
+pathlib.Path(f"here_{sys.argv[1]}").touch()
+while len(list(pathlib.Path(".").glob("here_*"))) < 2:
+    time.sleep(0.001)
 """
 
 
@@ -73,3 +81,18 @@ def test_a_named_folder_that_cannot_be_written_is_one_line(tmp_path: Path) -> No
     done = as_nobody(tmp_path, HOME="/nonexistent", WARP_CACHE_PATH="/proc/kernels")
     assert done.returncode == 1
     assert "WARP_CACHE_PATH: /proc/kernels cannot be made" in done.stderr.splitlines()[-1]
+
+
+def test_jobs_that_compile_into_one_folder_at_once(tmp_path: Path) -> None:
+    """As in an array of jobs on a cluster, whose home is shared."""
+    (tmp_path / "kernel.py").write_text(COMPILE.replace("values = ", BARRIER + "values = ", 1))
+    given = os.environ | {"PYTHONPATH": str(ROOT), "WARP_CACHE_PATH": str(tmp_path / "kernels")}
+    jobs = [
+        Popen([sys.executable, "kernel.py", str(k)], cwd=tmp_path, env=given, text=True, stdout=-1, stderr=-1)
+        for k in range(2)
+    ]
+    for job in jobs:
+        out, error = job.communicate()
+        assert out.startswith("[6.0, 6.0]"), error
+    left = [file.name for file in (tmp_path / "kernels").rglob("*") if "_p" in file.name and file.is_dir()]
+    assert left == []  # folders in which a job was still building

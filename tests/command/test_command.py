@@ -277,6 +277,27 @@ def test_a_disk_that_cannot_be_written_is_one_line(
     assert capsys.readouterr().err == f"error: out/table.csv: {os.strerror(number)}\n"
 
 
+def test_a_full_gpu_is_one_line_and_other_errors_stay(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    error = RuntimeError("Failed to allocate 4194304 bytes on device 'cuda:0'")
+
+    def work(config: object) -> None:
+        raise error
+
+    monkeypatch.setattr("torch.cuda.mem_get_info", lambda: (2**29, 8 * 2**30))
+    monkeypatch.setattr("pace.command.run.resolve_name", lambda _: work)
+    monkeypatch.setattr(sys, "argv", ["validate"])
+    assert run_command("validate") == 1
+    assert capsys.readouterr().err == (
+        "error: the GPU's memory is full (8.0 GiB, 0.5 free): by estimate a training run of 8,704 worlds fits if "
+        "nothing else runs there; give a smaller num_worlds\n"
+    )
+    error = RuntimeError("another")
+    with pytest.raises(RuntimeError, match="another"):
+        run_command("validate")
+
+
 def test_a_terminated_command_has_its_own_status(monkeypatch: pytest.MonkeyPatch) -> None:
     def work(config: object) -> None:
         raise Terminated

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 from torchrl.objectives import ClipPPOLoss
 
+from pace.arrays import graph
 from pace.arrays.graph import Graphs
 from pace.arrays.watch import DryRunError
 from pace.config.schedules import START, SchedulePoint
@@ -136,6 +137,22 @@ def test_an_update_that_is_undone_leaves_the_graphs_as_they_are(spoilt: int) -> 
         ends.append(state_of(trainer.checkpoint()))
     assert differing(*ends) == []
     assert all(bool(value.isfinite().all()) for name, value in ends[0].items() if name.startswith("weights"))
+
+
+def test_a_run_of_which_nothing_can_be_captured_is_the_run_without_graphs(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """On a GPU whose driver cannot: one line, and the same numbers."""
+
+    class Uncapturable:
+        def __init__(self, *_: Any) -> None:
+            raise RuntimeError("operation not supported")
+
+    monkeypatch.setattr(graph, "CudaGraph", Uncapturable)
+    graph._SAID.clear()
+    ends = [state_of(updated(trainer_of(small_config(), way), 5).checkpoint()) for way in (Graphs.TRY, Graphs.NONE)]
+    assert differing(*ends) == []
+    assert capsys.readouterr().err.count("warning: no CUDA graphs, so it is slower (") == 1
 
 
 def test_a_rollout_in_the_place_of_another_has_its_own_graphs() -> None:

@@ -68,7 +68,7 @@ def test_a_run_compiles_before_it_begins_and_a_second_one_nothing(
 def test_a_gpus_kernels_are_known_without_one() -> None:
     found = kernels_of_a_gpu(load_train_config())
     names = {each.module.name for each in found}
-    assert {"pace.sim.ball.kernels", "pace.task.game_kernels", "mujoco_warp._src.forward"} <= names
+    assert {"pace.sim.ball.step_kernel", "pace.task.game_kernels", "mujoco_warp._src.forward"} <= names
     assert len(names) > 50
     assert 256 in {each.block_dim for each in found}
     assert 1 not in {each.block_dim for each in found}

@@ -154,3 +154,30 @@ def test_the_last_words_of_a_run_on_a_full_disk_are_its_fault(tmp_path: Path, mo
     monkeypatch.setattr("pace.rl.recovery.save_checkpoint", full)
     with pytest.raises(RolloutError, match=r"not finite: .* could not be saved: .*No space left"):
         trainer.train()
+
+
+@pytest.mark.parametrize("first_bad", [1, 4])
+def test_a_full_memory_of_the_gpu_is_one_line_and_nothing_is_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, first_bad: int
+) -> None:
+    monkeypatch.setattr("torch.cuda.mem_get_info", lambda: (2**30, 24 * 2**30))
+    trainer = dummy_trainer(tmp_path, 20)
+    update, before = trainer.update, {}
+
+    def full() -> dict[str, float]:
+        if trainer.updates == first_bad - 1:
+            before.update({name: value.clone() for name, value in trainer.agent.state_dict().items()})
+            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 9.00 GiB")
+        return update()
+
+    trainer.update = full  # type: ignore[method-assign]
+    if first_bad == 1:  # there is nothing to save yet; the command says the line
+        with pytest.raises(torch.OutOfMemoryError):
+            trainer.train()
+        return
+    text = r"the GPU's memory is full \(24\.0 GiB, 1\.0 free\): by estimate .* of 34,304 worlds fits .*last_good"
+    with pytest.raises(RolloutError, match=text):
+        trainer.train()
+    good = load_checkpoint(tmp_path / "last_good")
+    assert good.counters["updates"] == first_bad - 1
+    assert_same(good.weights["agent"], before)

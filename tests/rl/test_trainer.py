@@ -259,7 +259,8 @@ def test_run_folder_holds_what_rebuilds_the_run(tmp_path: Path) -> None:
     config = parse(OmegaConf.load(tmp_path / "config.yaml"), TrainConfig)  # type: ignore[arg-type]
     assert config == trainer.config
     assert parse(load_checkpoint(tmp_path).config, TrainConfig) == trainer.config
-    assert json.loads((tmp_path / "versions.json").read_text())["packages"]["torch"] == torch.__version__
+    found = json.loads((tmp_path / "versions.json").read_text())["packages"]["torch"]
+    assert found.partition("+")[0] == torch.__version__.partition("+")[0]  # wheels for a GPU name it in one of the two
     assert list((tmp_path / "events").glob("events.out.tfevents*"))
 
 

@@ -20,11 +20,13 @@ from pace.config.ball import AirConfig, BallConfig, TableConfig
 from pace.config.base import ConfigError, config_dir, parse
 from pace.sim.ball.aero import AirTables
 from pace.sim.ball.air_tables import air_tables, air_tensors
-from pace.sim.ball.kernels import FORECAST_HORIZON, fly_step, forecast_flight, skip_flight
+from pace.sim.ball.forecast_kernel import FORECAST_HORIZON, forecast_flight
 from pace.sim.ball.rebound import Material
 from pace.sim.ball.robot_body import RobotBody
 from pace.sim.ball.scene import Scene
+from pace.sim.ball.skip_kernel import skip_flight
 from pace.sim.ball.state import BallEvents, BallState, Forecast
+from pace.sim.ball.step_kernel import fly_step
 
 __all__ = ["FORECAST_HORIZON", "BallEvents", "BallParams", "BallSim", "Forecast", "ball_preset"]
 

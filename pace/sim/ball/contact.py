@@ -1,18 +1,20 @@
-"""The first contact of a ball on an arc, located by bisection, as Warp functions."""
+"""The first contact of a ball on an arc, located by bisection, as Warp functions.
+
+A GPU's compiler copies a function into every place that calls it. So each of them is called in as few places as
+possible, for all kinds of contact and all surfaces: with one place for each, a kernel took minutes to compile.
+"""
 
 import warp as wp
 
 from pace.sim.ball.arc import Arc, arc_position, arc_velocity
 from pace.sim.ball.gaps import gap_to, surface_velocity
-from pace.sim.ball.scene import ALL_SURFACES, BODY, FLOOR, NET, NOTHING, PADDLE, TABLE, Gaps, Scene
+from pace.sim.ball.scene import BODY, FLOOR, NET, NOTHING, PADDLE, TABLE, Gaps, Scene
 
 #: m, a smaller gap counts as touching.
 TOUCH = 1.0e-5
 #: m/s, slower than this along the normal a touching ball rests; its hop would be 0.1 mm high and last 10 ms.
 REST_SPEED = 0.05
 BISECTIONS = 22
-
-_NEVER = wp.constant(1.0e6)
 
 
 @wp.struct
@@ -50,12 +52,8 @@ def closing_time(surface: int, arc: Arc, until: float, radius: float, scene: Sce
 
 
 @wp.func
-def grazing_time(surface: int, arc: Arc, radius: float, scene: Scene, world: int) -> float:
-    """When an arc that begins and ends clear of a surface touches it, or _NEVER: the gap's minimum decides."""
-    if gap_rate(surface, arc, 0.0, radius, scene, world) >= 0.0:
-        return _NEVER
-    if gap_rate(surface, arc, arc.duration, radius, scene, world) <= 0.0:
-        return _NEVER
+def nearest_time(surface: int, arc: Arc, radius: float, scene: Scene, world: int) -> float:
+    """When the gap is smallest on an arc that begins approaching and ends receding, by bisection."""
     low = wp.float32(0.0)
     high = wp.float32(arc.duration)
     for _ in range(BISECTIONS):
@@ -64,29 +62,47 @@ def grazing_time(surface: int, arc: Arc, radius: float, scene: Scene, world: int
             low = middle
         else:
             high = middle
-    gap, _normal = gap_to(surface, arc_position(arc, low), arc.clock + low, radius, scene, world)
-    if gap > 0.0:
-        return _NEVER
-    return closing_time(surface, arc, low, radius, scene, world)
+    return low
 
 
 @wp.func
-def touching_contact(surface: int, arc: Arc, gap: float, radius: float, scene: Scene, world: int) -> Contact:
-    """Contact on an arc that begins on the surface, or inside it, at ``gap`` (m), and ends inside it."""
+def closed_at(surface: int, arc: Arc, gap: float, end_gap: float, radius: float, scene: Scene, world: int) -> Contact:
+    """A time on the arc at which the gap is closed, and before which it closes once, as a :class:`Contact`.
+
+    The arc begins clear of the surface and ends inside it; or begins and ends clear of it, and the gap's minimum
+    decides; or begins on the surface, or inside it, at ``gap`` (m), and ends inside it.
+    """
     contact = Contact()
-    contact.surface = surface
-    before = gap_rate(surface, arc, 0.0, radius, scene, world)
-    if before < -REST_SPEED:
-        if gap > 0.0:
-            contact.time = closing_time(surface, arc, arc.duration, radius, scene, world)
-        return contact  # a paddle that closes in on a ball inside it strikes at once
-    if gap_rate(surface, arc, arc.duration, radius, scene, world) >= 0.0:
-        contact.surface = NOTHING  # still inside, but on its way out
-        return contact
-    contact.lasting = before <= REST_SPEED
+    contact.surface = NOTHING
     contact.time = arc.duration
-    if not contact.lasting:
-        contact.time = closing_time(surface, arc, arc.duration, radius, scene, world)
+    touching = gap <= TOUCH
+    inside = end_gap < 0.0
+    if touching != inside:
+        if inside:
+            contact.surface = surface
+        return contact
+    before = gap_rate(surface, arc, 0.0, radius, scene, world)
+    if touching and before < -REST_SPEED:
+        contact.surface = surface
+        if gap <= 0.0:
+            contact.time = 0.0  # a paddle that closes in on a ball inside it strikes at once
+        return contact
+    if not touching and before >= 0.0:
+        return contact
+    after = gap_rate(surface, arc, arc.duration, radius, scene, world)
+    if touching:
+        if after >= 0.0:
+            return contact  # still inside, but on its way out
+        contact.lasting = before <= REST_SPEED
+    else:
+        if after <= 0.0:
+            return contact
+        time = nearest_time(surface, arc, radius, scene, world)
+        least, _normal = gap_to(surface, arc_position(arc, time), arc.clock + time, radius, scene, world)
+        contact.time = time
+        if least > 0.0:
+            return contact
+    contact.surface = surface
     return contact
 
 
@@ -95,20 +111,9 @@ def contact_with(
     surface: int, arc: Arc, gap: float, end_gap: float, radius: float, scene: Scene, world: int
 ) -> Contact:
     """The first contact with ``surface`` on an arc over which its gap goes from ``gap`` to ``end_gap`` (m)."""
-    contact = Contact()
-    contact.surface = NOTHING
-    if gap <= TOUCH:
-        if end_gap < 0.0:
-            return touching_contact(surface, arc, gap, radius, scene, world)
-        return contact
-    time = wp.float32(_NEVER)
-    if end_gap < 0.0:
-        time = closing_time(surface, arc, arc.duration, radius, scene, world)
-    else:
-        time = grazing_time(surface, arc, radius, scene, world)
-    if time <= arc.duration:
-        contact.surface = surface
-        contact.time = time
+    contact = closed_at(surface, arc, gap, end_gap, radius, scene, world)
+    if contact.surface != NOTHING and not contact.lasting and contact.time > 0.0:
+        contact.time = closing_time(surface, arc, contact.time, radius, scene, world)
     return contact
 
 
@@ -142,13 +147,13 @@ def first_contact(
     moving = wp.min(sums[PADDLE], sums[BODY])
     if still >= speed * arc.duration and moving >= (speed + robot_speed) * arc.duration:
         return first  # all surfaces stay too far away
-    for surface in range(ALL_SURFACES):
+    for surface in range(surfaces):  # of a fixed number, Warp would write five copies
         relative = wp.float32(speed)
         if surface >= PADDLE:
             relative += robot_speed
         gap = gaps[surface]
         end_gap = end_gaps[surface]
-        if surface < surfaces and may_touch(gap, end_gap, relative, arc.duration):
+        if may_touch(gap, end_gap, relative, arc.duration):
             contact = contact_with(surface, arc, gap, end_gap, radius, scene, world)
             if contact.surface != NOTHING and contact.time < first.time:
                 first = contact

@@ -14,6 +14,7 @@ from pace.sim.ball.contact import Contact, first_contact
 from pace.sim.ball.gaps import gap_to, gaps_to, surface_velocity
 from pace.sim.ball.rebound import rebound
 from pace.sim.ball.scene import BODY, FLOOR, NET, NOTHING, PADDLE, TABLE, Body, Gaps, Scene, material_of
+from pace.sim.ball.state import BallArrays
 
 #: m, longest way of the ball against a near surface in one sub-step; less than the ball's radius, so none is jumped.
 MAX_TRAVEL = 0.015
@@ -44,6 +45,16 @@ class Leg:
     begins: wp.bool  # a new contact, not one that goes on
     normal: wp.vec3
     surface_velocity: wp.vec3
+
+
+@wp.func
+def flight_of(ball: BallArrays, world: int) -> Flight:
+    """The flight that begins with the ball of a world; its gaps are still to be found."""
+    flight = Flight()
+    flight.position = ball.position[world]
+    flight.velocity = ball.velocity[world]
+    flight.spin = ball.spin[world]
+    return flight
 
 
 @wp.func

@@ -6,7 +6,7 @@ from pace.sim.ball.aero import GRAVITY
 from pace.sim.ball.paddle import paddle_centre, paddle_pose
 from pace.sim.ball.rebound import box_distance, disc_distance
 from pace.sim.ball.robot_body import body_velocity, nearest_shape
-from pace.sim.ball.scene import ALL_SURFACES, BODY, FLOOR, NET, PADDLE, STATIC_SURFACES, TABLE, Gaps, Scene
+from pace.sim.ball.scene import ALL_SURFACES, BODY, FLOOR, NET, PADDLE, STATIC_SURFACES, Gaps, Scene
 
 _FAR = wp.constant(1.0e6)
 
@@ -29,11 +29,13 @@ def reachable_surfaces(
 @wp.func
 def gap_to(surface: int, position: wp.vec3, clock: float, radius: float, scene: Scene, world: int):
     """Gap (m, negative inside) between the ball and a surface, and the unit normal from the surface to the ball."""
-    if surface == TABLE:
-        distance, normal = box_distance(position, scene.table_centre, scene.table_half)
-        return distance - radius, normal
-    if surface == NET:
-        distance, normal = box_distance(position, scene.net_centre, scene.net_half)
+    if surface <= NET:  # one of the two boxes
+        centre = scene.table_centre
+        half = scene.table_half
+        if surface == NET:
+            centre = scene.net_centre
+            half = scene.net_half
+        distance, normal = box_distance(position, centre, half)
         return distance - radius, normal
     if surface == FLOOR:
         return position[2] - radius, wp.vec3(0.0, 0.0, 1.0)

@@ -70,6 +70,11 @@ class MjwarpEngine(StateTensors):
         graphs = graphs_of(engine, device)
         with warp_scope(device):
             self.model = mjw.put_model(model, batch_sizes=dict.fromkeys(ModelFields.NAMES, num_worlds))
+            # Two boxes (trunk and table) then meet by MuJoCo's own test for boxes, as on the other engine, and not by
+            # the general convex algorithm, which finds other points. Nothing else depends on the flag (engines.md).
+            self.model.opt.disableflags |= mjw.DisableBit.NATIVECCD
+            order = mjw.DeterminismType.ALL if engine.deterministic else mjw.DeterminismType.NONE
+            self.model.opt.deterministic = int(order)
             self.model.opt.warn_overflow = 0  # would print a line per world and step; overflowed() reports it instead
             # On a GPU all iterations are launched, and converged worlds skip theirs: a loop that ends on the device
             # would interrupt the capture around it, and torch would lose track of the graph's memory.

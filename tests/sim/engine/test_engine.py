@@ -414,6 +414,41 @@ def test_a_fall_is_seen_in_the_body_contacts(fresh):
     assert engine.qpos_path[0, -1, 2] > 0.02  # it lies on the floor, not in it
 
 
+def test_a_trunk_that_falls_on_the_table_moves_alike_on_both_engines():
+    """Box on box, by the same test for boxes: MuJoCo Warp's general algorithm finds other points, and is 3 mrad off."""
+    yaw, pitch = torch.tensor([[0.3, 0.9, 1.7, 2.6], [1.5, 1.7, 1.35, 1.9]])  # face down
+    turns = [((0.5 * angle).cos(), (0.5 * angle).sin()) for angle in (yaw, pitch)]
+    (cos_yaw, sin_yaw), (cos_pitch, sin_pitch) = turns
+    lying_down = torch.stack([cos_yaw * cos_pitch, -sin_yaw * sin_pitch, cos_yaw * sin_pitch, sin_yaw * cos_pitch], 1)
+    seen = []
+    for name in ("native", "mjwarp"):
+        engine, model = build(name)
+        start = standing(model)
+        start[:, 0], start[:, 1] = torch.tensor([[-1.0, -0.9, -0.8, -0.7], [0.0, 0.1, 0.3, 0.5]])
+        start[:, 2], start[:, 3:7] = 1.22, lying_down
+        engine.reset(EVERY, start, still(model))
+        touched = torch.zeros(WORLDS)
+        for _ in range(25):
+            engine.advance(hold(engine, model), still(model))
+            touched = touched.maximum(engine.body_contact[:, contact_bodies(model).index("trunk")])
+        assert touched.all()
+        seen.append(engine.qpos_path[:, -1].clone())
+    torch.testing.assert_close(seen[0], seen[1], rtol=0, atol=5e-5)
+
+
+def test_a_fixed_order_of_the_sums_changes_nothing_on_a_cpu():
+    """``engine.deterministic``: a CPU has a fixed order anyway."""
+    seen = []
+    for fixed in (False, True):
+        engine, model = build("mjwarp", deterministic=fixed)
+        generator = torch.Generator().manual_seed(6)
+        for _ in range(8):
+            engine.advance(random_targets(engine, model, generator), still(model))
+        assert (engine.model.opt.deterministic != 0) is fixed
+        seen.append(engine.qpos_path.clone())
+    assert torch.equal(*seen)
+
+
 def test_paddle_in_the_table_is_seen(fresh):
     engine, model = fresh
     data = mujoco.MjData(model)
