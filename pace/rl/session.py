@@ -40,6 +40,7 @@ from pace.runs.run_folder import METRICS, RunFolder, is_run
 
 if TYPE_CHECKING:
     from pace.task.env import TableTennisEnv
+COMMAND = "pace.rl.train"
 SEEDS_APART = 1_000_003  # between the stages of a curriculum: further than seeds of runs lie apart
 
 
@@ -62,8 +63,9 @@ def train_from_config(composed: DictConfig) -> None:
     config.processes = config.processes or suitable_size(config.num_worlds, device)
     if is_first_here():
         warm(config, device)  # before any clock runs, and once for all processes of this machine
-    arguments = overrides if hydra.mode == RunMode.MULTIRUN else None  # of this job; the command's are of all
-    with process_group(config.processes, device, arguments) as group:
+    # a job of a sweep, which a launcher may have started by another program; the command's arguments are of all jobs
+    command = ["-m", COMMAND, *overrides] if hydra.mode == RunMode.MULTIRUN else None
+    with process_group(config.processes, device, command) as group:
         trainer = build_trainer(config, saved, device, group)
         if trainer.run is not None:
             announce(trainer, trainer.run, saved, chosen)
