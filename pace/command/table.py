@@ -239,7 +239,8 @@ COMMANDS = {
         summary="measurements of engines, step sizes, motors, predictors, ... (extra dev)",
         usage="STUDY [STUDY ...] [key=value ...]",
         about="Prints the tables of the documentation and draws their figures. STUDY: reaction, parity, steps, solver, "
-        "motors, predictor, adaptation, senses, rounding, recipe, learning, architecture, or all.",
+        "motors, robots, ankles, predictor, adaptation, senses, rounding, serves, recipe, learning, memory, soak, "
+        "architecture, or all.",
         examples=("parity worlds=16", "steps solver run=pretrained/pace", "predictor serves=512 cases=[rubber]"),
         rest="studies",
     ),

@@ -1,6 +1,7 @@
 """The studies by name: engine parity, step sizes, solver settings, paddle reaction, motors, cost of the robots,
 ankles, predictors and their error bounds, adaptation to the paddle, on-board estimates, bf16 rounding in
-the update, the balls of a machine, the learning curves of the recipes that were tried, and the rooms of the package.
+the update, the balls of a machine, the learning curves of the recipes that were tried, memory and serves of long runs,
+and the rooms of the package.
 
 They print the tables of the pages in ``docs/results`` and draw their figures.
 """
@@ -21,6 +22,7 @@ from pace.studies import (
     ankles,
     architecture,
     learning_curves,
+    memory,
     motors,
     parity,
     predictor,
@@ -30,7 +32,9 @@ from pace.studies import (
     rounding,
     senses,
     serves,
+    soak,
     steps,
+    watch,
 )
 from pace.studies.common import save_figure
 from pace.studies.swings import Swings, policy_swings, random_swings
@@ -148,6 +152,19 @@ def study_learning(options: Options) -> None:
     print(f"wrote {learning_curves.draw(curves, options.out / 'learning.png')}")
 
 
+def study_memory(options: Options) -> None:
+    watched = memory.watch_training(options.out)
+    print(watch.text(watched, "updates"))
+    save_figure(options.out / "memory.png", (11, 3), lambda figure: watch.draw(watched, "updates", figure))
+
+
+def study_soak(options: Options) -> None:
+    found, watched = soak.soak(load_policy(options.run or GENERALIST), options.serves, options.worlds)
+    print(soak.text(found))
+    print(watch.text(watched, "serves"))
+    save_figure(options.out / "soak.png", (7.5, 3), lambda figure: watch.draw(watched, "serves", figure))
+
+
 def study_architecture(options: Options) -> None:
     print(f"wrote {architecture.write(options.out)}")
 
@@ -167,6 +184,8 @@ STUDIES = {
     "serves": study_serves,
     "recipe": study_recipe,
     "learning": study_learning,
+    "memory": study_memory,
+    "soak": study_soak,
     "architecture": study_architecture,
 }
 
