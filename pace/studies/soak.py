@@ -68,7 +68,7 @@ def text(found: Account) -> str:
     """The account in words."""
     failures = ", ".join(f"{name.replace('_', ' ')} {count:,}" for name, count in found.failures.items() if count)
     return (
-        f"{found.played:,} serves: {found.first:,} first ones, {found.bad:,} beside the table, {found.counted:,} counted "
-        f"and {found.beyond:,} after a world had its number; counted are {found.success:,} successes, {failures}; "
+        f"{found.played:,} serves: {found.first:,} first ones, {found.bad:,} bad, {found.counted:,} counted, "
+        f"{found.beyond:,} after a world had its number. Of the counted {found.success:,} successes, {failures}; "
         f"{found.missing:,} missing"
     )

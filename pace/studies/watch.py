@@ -48,8 +48,10 @@ def require_proc() -> None:
 
 @dataclass
 class Watch:
-    """Samples of a run, one each ``interval`` seconds at most, from its first progress on: progress (updates, serves), seconds, memory (MiB), open
-    files, and the size of what it writes (MiB)."""
+    """Samples of a run, one each ``interval`` seconds at most, from its first progress on.
+
+    Each has the progress (updates, serves), seconds, memory (MiB), open files, and the size of what it writes (MiB).
+    """
 
     pid: int
     folder: Path | None = None
