@@ -6,8 +6,7 @@ import torch
 
 from pace.config.automatic import Machine
 from pace.config.base import ConfigError
-
-GIB = 2**30
+from pace.memory import GIB, available_memory
 
 
 def resolve_device(device: str | torch.device) -> torch.device:
@@ -43,4 +42,4 @@ def machine_of(device: torch.device, count: int = 1) -> Machine:
     if device.type == "cuda":
         memory = torch.cuda.get_device_properties(device).total_memory / GIB
         return Machine("cuda", memory, has_bf16(device), count)
-    return Machine("cpu", bf16=has_bf16(device))
+    return Machine("cpu", available_memory(), has_bf16(device))

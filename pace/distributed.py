@@ -22,7 +22,9 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
+from pace.config.automatic import SHARE_OF_MEMORY, memory_needed
 from pace.cores import threads_of, usable_cores
+from pace.memory import available_memory
 
 T = TypeVar("T")
 
@@ -114,11 +116,14 @@ class ProcessGroup:
 
 
 def suitable_size(num_worlds: int, device: torch.device) -> int:
-    """Processes to share ``num_worlds`` on this machine: one a core, with at least 256 worlds each; one for a GPU."""
+    """Processes to share ``num_worlds`` on this machine: one a core, with at least 256 worlds each, that fit into its
+    memory; one for a GPU."""
     if device.type != "cpu":
         return 1
     most = min(usable_cores(), num_worlds // WORLDS_PER_PROCESS)
-    return max((size for size in range(1, most + 1) if num_worlds % size == 0), default=1)
+    memory = SHARE_OF_MEMORY * available_memory()
+    sizes = (size for size in range(1, most + 1) if memory_needed(num_worlds, size) <= memory)
+    return max((size for size in sizes if num_worlds % size == 0), default=1)
 
 
 @contextmanager
