@@ -33,6 +33,8 @@ bench: venv  ## measure speed and memory: python -m pace.bench $(ARGS)
 	$(BIN)/python -m pace.bench $(ARGS)
 
 # The stamp holds what was installed; it is compared by content, since a checkout changes the times of files.
+# A CPU build of torch comes first, if pip is told where one lies: of files without a hash in their address pip takes none
+# as long as there is another.
 venv:  ## make or renew .venv from requirements.lock
 	@set -e; \
 	if cat requirements.lock pyproject.toml | cmp -s - $(VENV)/.installed && $(BIN)/python -c "" 2>/dev/null; then exit 0; fi; \
@@ -50,6 +52,8 @@ venv:  ## make or renew .venv from requirements.lock
 	  $$python -m venv --clear $(VENV); \
 	fi; \
 	echo "== installing requirements.lock into $(VENV): a few minutes, once"; \
+	sed -n 's/^torch==[0-9.]*/&+cpu/; /^torch==/,/[^\\]$$/p' requirements.lock > $(VENV)/torch-cpu.txt; \
+	$(BIN)/python -m pip install --quiet --require-hashes --no-deps -r $(VENV)/torch-cpu.txt 2> /dev/null || true; \
 	$(BIN)/python -m pip install --disable-pip-version-check --require-hashes --no-deps -r requirements.lock; \
 	if $(BIN)/python -c 'import importlib.metadata as m, sys; sys.exit(sys.platform != "linux" or "+" in m.version("torch"))'; then \
 	  $(BIN)/python -m pip install --disable-pip-version-check --require-hashes --no-deps -r requirements-cuda.lock; \
