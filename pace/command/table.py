@@ -240,7 +240,7 @@ COMMANDS = {
         usage="STUDY [STUDY ...] [key=value ...]",
         about="Prints the tables of the documentation and draws their figures. STUDY: reaction, parity, steps, solver, "
         "motors, robots, ankles, predictor, adaptation, senses, rounding, serves, recipe, learning, memory, soak, "
-        "architecture, or all.",
+        "page, architecture, or all.",
         examples=("parity worlds=16", "steps solver run=pretrained/pace", "predictor serves=512 cases=[rubber]"),
         rest="studies",
     ),

@@ -272,6 +272,7 @@ class StudiesConfig:
     studies: list[str]  # names, or all
     worlds: int
     serves: int
+    hours: float  # of play
     run: str | None
     cases: list[str]
     predictors: list[str]
@@ -281,3 +282,4 @@ class StudiesConfig:
     def __post_init__(self) -> None:
         for name in ("worlds", "serves"):
             require(getattr(self, name) >= 1, f"{name} must be at least 1, got {getattr(self, name)}")
+        require(0 < self.hours < 1000, f"hours must lie in (0, 1000), got {self.hours}")

@@ -24,6 +24,7 @@ from pace.studies import (
     learning_curves,
     memory,
     motors,
+    page_soak,
     parity,
     predictor,
     reaction,
@@ -49,6 +50,7 @@ class Options:
 
     worlds: int
     serves: int
+    hours: float
     run: Path | None
     cases: list[str]
     predictors: list[Path]
@@ -165,6 +167,12 @@ def study_soak(options: Options) -> None:
     save_figure(options.out / "soak.png", (7.5, 3), lambda figure: watch.draw(watched, "serves", figure))
 
 
+def study_page(options: Options) -> None:
+    watched, sent = page_soak.watch_page(load_policy(options.run or GENERALIST), options.hours)
+    print(f"{watch.text(watched, 's of play')}\n{sent / 2**20:.0f} MiB sent to the browser")
+    save_figure(options.out / "page_soak.png", (7.5, 3), lambda figure: watch.draw(watched, "s of play", figure))
+
+
 def study_architecture(options: Options) -> None:
     print(f"wrote {architecture.write(options.out)}")
 
@@ -186,6 +194,7 @@ STUDIES = {
     "learning": study_learning,
     "memory": study_memory,
     "soak": study_soak,
+    "page": study_page,
     "architecture": study_architecture,
 }
 
@@ -204,6 +213,7 @@ def study_from_config(composed: DictConfig) -> None:
     options = Options(
         worlds=config.worlds,
         serves=config.serves,
+        hours=config.hours,
         run=Path(config.run) if config.run else None,
         cases=config.cases,
         predictors=[Path(path) for path in config.predictors],

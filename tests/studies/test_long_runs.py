@@ -100,3 +100,16 @@ def test_a_long_evaluation_loses_no_serve_and_does_not_grow() -> None:
     grown, _ = watch.growth(progress, used)
     assert grown < 5.0  # MiB
     assert np.ptp(files[progress > 400]) <= 1
+
+
+@pytest.mark.slow
+def test_a_page_is_watched_while_a_browser_looks() -> None:
+    pytest.importorskip("mjviser")
+    from pace.studies.page_soak import watch_page
+
+    watched, sent = watch_page(load_policy("pretrained/pace"), 10.0 / 3600.0, interval=0.05)
+    progress, _, used, files, _ = watched.columns()
+    assert progress[-1] == pytest.approx(10.0, abs=1.0)
+    assert sent > 10_000
+    assert np.all(used > 100)
+    assert np.ptp(files[len(files) // 2 :]) <= 2
