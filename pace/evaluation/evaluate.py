@@ -17,11 +17,13 @@ from pace.config.overrides import override_task
 from pace.config.training import TrainConfig
 from pace.devices import resolve_device
 from pace.evaluation.bar import serve_bar
-from pace.evaluation.figures import write_figures
+from pace.evaluation.figures import FIGURES, write_figures
 from pace.evaluation.first_ball import first_ball_row
 from pace.evaluation.quality import QualityRecorder
+from pace.evaluation.report import FILES as REPORT
 from pace.evaluation.report import describe, tables, write_report
 from pace.evaluation.serves import MakeRecorder, Row, evaluate_row
+from pace.evaluation.sweep import FILES as SWEEP
 from pace.evaluation.sweep import (
     Cell,
     Tables,
@@ -53,13 +55,18 @@ def evaluate_from_config(composed: DictConfig) -> None:
     told = task_line(config.task, saved.config, task)
     print(f"policy {policy.source}\n{told}\n{describe(context)}", flush=True)
     cells = plan(config, policy, task, overrides, context["versions"])
-    folder = make_out(config.out, "evaluation")
+    folder = make_out(config.out, "evaluation", files_of(config))
     finished = finished_cells(folder, cells) if cells else {}
     if config.rows:
         first = evaluate_table(config, policy, task, overrides, folder, context)
         finished |= played_first_balls(config, cells, first)
     if cells:
         _announce(run_sweep(config, policy, cells, finished, folder, context))
+
+
+def files_of(config: EvaluateConfig) -> list[str]:
+    """Names of the files that an evaluation writes."""
+    return [*((*REPORT, *FIGURES) if config.rows else ()), *(SWEEP if config.sweep else ())]
 
 
 def plan(

@@ -54,7 +54,7 @@ def compare_from_config(composed: DictConfig) -> None:
     curves = {name: seeds for name, seeds in curves.items() if any(len(seed.samples) for seed in seeds)}
     what = f"metrics of {config.window:g} control steps or more (window=)"
     require(bool(curves or policies), f"nothing to compare: no run has {what}, and two policies are played, no others")
-    out = make_out(config.out, "comparison")
+    out = make_out(config.out, "comparison", [PAGE, DATA, *([config.figure] if curves else [])])
     sections, files = [], []
     content: dict[str, Any] = {"runs": config.runs, "versions": versions()}
     if curves:

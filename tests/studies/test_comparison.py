@@ -13,6 +13,7 @@ import yaml
 
 from pace.config.base import to_dict
 from pace.runs.metrics import Curve
+from pace.runs.own_files import LIST
 from pace.studies.compare import main
 from pace.studies.comparison import STUDENT, mean_interval, rate_table
 from pace.studies.run_groups import differences, group_runs, read_run
@@ -73,7 +74,7 @@ def test_curves_are_drawn_with_their_table(tmp_path: Path, capsys: pytest.Captur
     out = tmp_path / "out"
     assert command(main, *map(str, runs), "play=false", f"out={out}") == 0
     printed = capsys.readouterr().out
-    assert {file.name for file in out.iterdir()} == {"compare.md", "compare.json", "compare.png"}
+    assert {file.name for file in out.iterdir()} == {"compare.md", "compare.json", "compare.png", LIST}
     assert "75.0 (11.5 to 100.0)" in printed  # 12.706 standard errors, of at most 100 %
     assert "75.0 (11.5 to 100.0)" in (out / "compare.md").read_text()
     assert (out / "compare.png").read_bytes().startswith(b"\x89PNG")
