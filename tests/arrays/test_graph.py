@@ -243,7 +243,11 @@ def test_a_part_of_what_cannot_be_captured_still_can(monkeypatch: pytest.MonkeyP
             self.replay = function
 
     count = torch.zeros(())
-    inner = CapturedCall(lambda: count.add_(1.0), torch.device("cpu"), Graphs.TRY)
+
+    def count_on() -> None:
+        count.add_(1.0)
+
+    inner = CapturedCall(count_on, torch.device("cpu"), Graphs.TRY)
     outer_function = lambda: inner()  # noqa: E731  # it must be this object
     outer = CapturedCall(outer_function, torch.device("cpu"), Graphs.TRY)
     monkeypatch.setattr(graph, "CudaGraph", OnlyInner)
