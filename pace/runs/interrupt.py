@@ -53,7 +53,7 @@ class StopRequest:
 
 @contextmanager
 def terminable() -> Iterator[None]:
-    """The first SIGTERM or SIGHUP in the block raises :class:`Terminated`, so that it cleans up; later ones do nothing."""
+    """The first SIGTERM or SIGHUP in the block raises :class:`Terminated`, which cleans up; later ones are ignored."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
