@@ -20,7 +20,7 @@ import torch
 from pace.config.base import ConfigError
 from pace.rl.train import main
 from pace.runs.checkpoint import CheckpointError, find_checkpoint, load_checkpoint
-from pace.runs.checkpoint_folders import FOLDER, list_checkpoints
+from pace.runs.checkpoint_folders import FOLDER, list_checkpoints, update_of
 from pace.runs.run_folder import RunFolder
 from tests.helpers.outside import SMALL, command
 from tests.helpers.training import assert_same_run, dummy_trainer, rows_of
@@ -256,17 +256,18 @@ def test_real_runs_killed_at_random_moments_resume_bit_for_bit(tmp_path: Path, p
                 time.sleep(0.005)
         deadline = time.monotonic() + generator.uniform(0.0, 1.0)
         during_a_save = kills % 3 == 0
+        most = updates * (kills + 1) // 22  # so that the run does not end before its last kill
         while process.poll() is None and time.monotonic() < deadline and not (during_a_save and is_saving(broken)):
+            if any(update_of(checkpoint) >= most for checkpoint in list_checkpoints(broken)):
+                break
             time.sleep(0.0005)
-        if process.poll() is not None:
-            break
+        assert process.poll() is None, f"it ended before kill {kills + 1}: give it more updates"
         process.kill()
         process.wait()
         kills += 1
         for checkpoint in list_checkpoints(broken):
             load_checkpoint(checkpoint)
-    if load_checkpoint(broken).counters["updates"] < updates:
-        assert start(f"resume={broken}", *limits).wait(900) == 0
-    assert kills >= 10
+    assert kills == 20
+    assert start(f"resume={broken}", *limits).wait(900) == 0
     assert_same_run(whole, broken)
     assert not is_saving(broken)
