@@ -243,8 +243,14 @@ def test_a_part_of_what_cannot_be_captured_still_can(monkeypatch: pytest.MonkeyP
             self.replay = function
 
     count = torch.zeros(())
-    inner = CapturedCall(lambda: count.add_(1.0), torch.device("cpu"), Graphs.TRY)
-    outer_function = lambda: inner()  # noqa: E731  # it must be this object
+
+    def add_one() -> None:
+        count.add_(1.0)
+
+    def outer_function() -> None:
+        inner()
+
+    inner = CapturedCall(add_one, torch.device("cpu"), Graphs.TRY)
     outer = CapturedCall(outer_function, torch.device("cpu"), Graphs.TRY)
     monkeypatch.setattr(graph, "CudaGraph", OnlyInner)
     for _ in range(5):

@@ -12,6 +12,7 @@ from pace.config.training import load_train_config
 from pace.devices import resolve_device
 from pace.sim.engine.base import EngineParams
 from pace.sim.engine.factory import make_engine
+from pace.sim.engine.mjwarp import MjwarpEngine
 from pace.sim.engine.native import NativeEngine
 from pace.sim.robot import build_model
 from pace.sim.robot_spec import RobotSpec
@@ -444,6 +445,7 @@ def test_a_fixed_order_of_the_sums_changes_nothing_on_a_cpu():
         generator = torch.Generator().manual_seed(6)
         for _ in range(8):
             engine.advance(random_targets(engine, model, generator), still(model))
+        assert isinstance(engine, MjwarpEngine)
         assert (engine.model.opt.deterministic != 0) is fixed
         seen.append(engine.qpos_path.clone())
     assert torch.equal(*seen)
