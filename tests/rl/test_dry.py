@@ -279,7 +279,7 @@ def test_a_learning_rate_that_is_lost_in_a_resume_is_seen(monkeypatch: pytest.Mo
 
 TRAINED = (
     "device=cpu", "engine.graph=dry", "num_worlds=32", "minutes=0", "progress=false", "tensorboard=false",
-    "algo.actor_hidden=[32]", "algo.critic_hidden=[32]", "predictor.batches_per_update=8",
+    "algo.actor_hidden=[32]", "algo.critic_hidden=[32]", "algo.autocast=mixed", "predictor.batches_per_update=8",
     *IN_SAMPLES,
 )  # fmt: skip
 CHANGES = (  # 128 control steps an update, 192 later
