@@ -67,7 +67,7 @@ def choose(composed: DictConfig, machine: Machine) -> tuple[DictConfig, dict[str
 
 def in_words(chosen: dict[str, Any]) -> str:
     """The chosen values in one line."""
-    return ", ".join(KEYS[key].format(value) for key, value in chosen.items())
+    return ", ".join(KEYS.get(key, f"{key}={{}}").format(value) for key, value in chosen.items())
 
 
 def left_open(composed: DictConfig) -> set[str]:

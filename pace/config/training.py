@@ -169,5 +169,5 @@ def load_train_config(overrides: list[str] | None = None) -> TrainConfig:
 # Another number of processes means new worlds; with out=, a new run folder goes on from the checkpoint.
 RESUME_KEYS = (
     "resume", "samples", "minutes", "checkpoint_minutes", "tensorboard", "progress", "device", "processes", "plugins",
-    "out", "judge.serves", "judge.last_serves", "judge.after", "judge.video",
+    "engine.graph", "out", "judge.serves", "judge.last_serves", "judge.after", "judge.video",
 )  # fmt: skip

@@ -9,13 +9,14 @@ from typing import Any
 import pytest
 import torch
 
+from pace.arrays.graph import Graphs, graphs_of
 from pace.config.automatic import CPU, KEYS, Machine, choose, in_words, left_open
-from pace.config.base import compose, parse
+from pace.config.base import ConfigError, compose, parse, to_dict
 from pace.config.training import TrainConfig, load_train_config
 from pace.rl import session
 from pace.rl.agent import compute_dtype
 from pace.rl.train import main
-from pace.runs.checkpoint import load_checkpoint
+from pace.runs.checkpoint import Checkpoint, load_checkpoint
 
 
 def chosen(machine: Machine, *overrides: str) -> tuple[TrainConfig, dict[str, Any]]:
@@ -98,10 +99,40 @@ def test_a_run_says_and_saves_what_it_has_chosen(
 
 
 def test_a_run_of_a_gpu_that_goes_on_without_bf16_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    config, saved = chosen(Machine("cuda", 80.0, True), "algo.autocast=mixed")[0], object()
+    config, saved = chosen(Machine("cuda", 80.0, True), "algo.autocast=mixed")[0], None
     monkeypatch.setattr(session, "device_type_of", lambda _: "cuda")
     for supported, number_format in ((True, "mixed"), (False, "fp32")):
         monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda value=supported: value)
         changed = session.adapt(config, saved, torch.device("cpu"), [])  # type: ignore[arg-type]
         assert config.algo.autocast == number_format
         assert changed == ({} if supported else {"algo.autocast": "fp32"})
+
+
+@pytest.mark.parametrize(("saved_on", "graph", "resumed_on"), [("cuda", "always", "cpu"), ("cpu", "dry", "cuda")])
+def test_a_run_that_changes_devices_leaves_graphs_of_the_other_kind(
+    saved_on: str, graph: str, resumed_on: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session, "device_type_of", lambda _: saved_on)
+    monkeypatch.setattr(session, "has_bf16", lambda _: True)
+    monkeypatch.setattr("pace.arrays.graph.memory_pool_is_off", lambda _: False)
+    config, device = load_train_config([f"engine.graph={graph}"]), torch.device(resumed_on)
+    with pytest.raises(ConfigError, match=r"give device=cpu|needs a GPU"):
+        graphs_of(config.engine, device)
+    changed = session.adapt(config, None, device, [])  # type: ignore[arg-type]
+    assert in_words(changed) == "engine.graph=auto"
+    assert graphs_of(config.engine, device) is (Graphs.NONE if resumed_on == "cpu" else Graphs.TRY)
+    config.engine.graph = "never"  # is for both
+    assert session.adapt(config, None, device, []) == {}  # type: ignore[arg-type]
+
+
+def test_the_graphs_of_a_resumed_run_may_be_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    saved = Checkpoint(to_dict(load_train_config(["engine.graph=dry"])), {"samples": 1.0}, {}, None)
+    for given, engine in (["engine.graph=auto"], "mjwarp"), ([], "auto"):
+        config = session.resumed_config(saved, "somewhere", given)
+        assert config.engine.graph == (given[0].split("=")[1] if given else "dry")
+        session.adapt(config, saved, torch.device("cpu"), given)
+        assert config.engine.name == engine  # that of the worlds
+    monkeypatch.setattr(session, "device_type_of", lambda _: "cuda")
+    config = session.resumed_config(saved, "somewhere", ["engine.graph=never"])
+    assert session.adapt(config, saved, torch.device("cpu"), ["engine.graph=never"]) == {}
+    assert config.engine.graph == "never"

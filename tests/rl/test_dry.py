@@ -320,3 +320,4 @@ def test_the_command_resumes_exactly(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert train(monkeypatch, *TRAINED, f"out={parts}", "samples=512") == 0
     assert train(monkeypatch, f"resume={parts}", "samples=1024", "progress=false") == 0
     assert differing(state_of(load_checkpoint(whole)), state_of(load_checkpoint(parts))) == []
+    assert train(monkeypatch, f"resume={parts}", "samples=1152", "progress=false", "engine.graph=auto") == 0
