@@ -175,6 +175,11 @@ def is_first_here() -> bool:
     return MEMBERSHIP not in os.environ and (not under_torchrun() or os.environ["LOCAL_RANK"] == "0")
 
 
+def is_rank_0() -> bool:
+    """Whether this process will be rank 0 of its run's process group."""
+    return MEMBERSHIP not in os.environ and (not under_torchrun() or os.environ["RANK"] == "0")
+
+
 def own_device(device: str) -> str:
     """``device``; under ``torchrun``, for ``cuda`` and ``auto``, the GPU of this process's local rank."""
     if under_torchrun() and device in ("auto", "cuda") and torch.cuda.is_available():

@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -214,6 +215,24 @@ def test_a_fault_of_one_process_ends_all() -> None:
         return str(found.value)
 
     assert all("policy column 1 of world 3 at step 3" in text for text in together(fault))
+
+
+def test_a_signal_to_any_process_ends_the_run_and_rank_0_says_when_else() -> None:
+    def asked(group: ProcessGroup, signalled: int, samples: int) -> tuple[str | None, bool, str | None]:
+        trainer = trainer_of(group)
+        trainer.config.samples, trainer.config.checkpoint_minutes = 100, 1e6
+        trainer.samples = samples if group.rank == 0 else 0  # clocks differ, and so may what is due
+        trainer.stop.name = "SIGTERM" if group.rank == signalled else None
+        return *trainer._asked(0.0), trainer.stop.name
+
+    nobody = 2
+    for signalled, samples, found in (
+        (0, 0, ("stopped by SIGTERM", False, "SIGTERM")),
+        (1, 100, ("stopped by SIGTERM", False, "SIGTERM")),
+        (nobody, 0, (None, False, None)),
+        (nobody, 100, ("samples=100 reached", False, None)),
+    ):
+        assert together(partial(asked, signalled=signalled, samples=samples)) == [found, found]
 
 
 def spoil_rollout(trainer: Trainer) -> None:

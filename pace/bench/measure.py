@@ -18,7 +18,8 @@ from pace.config.base import parse
 from pace.config.commands import BenchConfig
 from pace.cores import usable_cores
 from pace.devices import machine_of, resolve_device
-from pace.runs.run_folder import make_out, versions
+from pace.runs.own_files import make_out
+from pace.runs.run_folder import versions
 
 BUSY_LOAD = 0.5  # per core; a higher load gives a warning
 

@@ -33,7 +33,8 @@ from pace.deploy.graph import (
 )
 from pace.onboard.estimate import columns
 from pace.rl.policies import TaskPolicy, load_policy
-from pace.runs.run_folder import VERSIONS, make_out, versions
+from pace.runs.own_files import make_out
+from pace.runs.run_folder import VERSIONS, versions
 from pace.sim.robot import build_model, joint_armature, joint_friction, joint_gains, motor_lines, nominal_pose
 from pace.sim.robot_spec import RobotSpec
 from pace.task.observations import POLICY, layout

@@ -18,6 +18,8 @@ from pace.runs.checkpoint import load_checkpoint
 CARD = "README.md"
 EVALUATION, SWEEP, VERSIONS = "evaluation.json", "sweep.json", "versions.json"
 GROUPS = ("robot", "ball", "serve", "randomization", "sensing", "observation", "reward", "predictor", "algo")
+TASK = "task, at the end"
+FIRST_ROW = f"| {TASK} |"  # of a card: what tells one from another README.md
 #: Keys of the machine, not of the task.
 MACHINE = ("engine.threads=", "engine.graph=", "engine.physics_dt=")
 
@@ -41,7 +43,7 @@ def _facts(folder: Path, versions: Mapping[str, Any]) -> str:
     command = versions.get("command", [])[1:]
     named = [(group, getattr(config, group).name) for group in GROUPS]
     rows = [
-        ("task, at the end", ", ".join(f"`{group}={name}`" for group, name in named)),
+        (TASK, ", ".join(f"`{group}={name}`" for group, name in named)),
         ("curriculum", _curriculum(config)),
         ("seed", str(config.seed)),
         ("control steps", f"{counters['samples'] / 1e6:.1f} million"),

@@ -37,8 +37,9 @@ from pace.evaluation.sweep import (
 )
 from pace.evaluation.task import own_pauses, policy_on, task_line
 from pace.rl.policies import TaskPolicy, built_in_policy, load_policy
+from pace.runs.own_files import make_out
 from pace.runs.progress import clock
-from pace.runs.run_folder import make_out, versions
+from pace.runs.run_folder import versions
 
 TASK_PARTS = ("robot", "ball", "engine", "randomization", "sensing")  # parts of the task in the report
 

@@ -8,19 +8,22 @@ from typing import Any
 
 import torch
 
-from pace.config.base import compose, parse
+from pace.config.base import ConfigError, compose, parse
 from pace.config.commands import EvaluateConfig, PaperRow
 from pace.config.judge import JudgeConfig
 from pace.evaluation.evaluate import circumstances
+from pace.evaluation.figures import FILES as FIGURES
 from pace.evaluation.figures import write_figures
+from pace.evaluation.report import FILES as REPORT
 from pace.evaluation.report import write_report
 from pace.evaluation.serves import EvaluationError, Row, evaluate_row
 from pace.evaluation.task import policy_on, task_line
 from pace.evaluation.text import interval, number, text_table
 from pace.rl.policies import load_policy
 from pace.runs.files import say, tell
+from pace.runs.own_files import make_out
+from pace.runs.run_folder import EVALUATION
 
-FOLDER = "evaluation"  # in the run's folder
 DEVICE = "cpu"  # a GPU's memory belongs to the run
 SEED = 1  # as that of pace evaluate
 
@@ -79,13 +82,16 @@ class RunJudge:
         given = [f"run='{run}'", f"rows=[{self.config.serve}]", f"serves={self.config.last_serves}", f"seed={SEED}"]
         given += [f"num_worlds={self.config.last_worlds}", f"device={DEVICE}", "first_ball=[]"]
         options = parse(compose("evaluate", given), EvaluateConfig)
-        folder = run / FOLDER
-        folder.mkdir(exist_ok=True)
+        tell(task_line("table", saved.config, policy.config))
+        tell(closing_table(row.summary, options.paper))
+        try:
+            folder = make_out(str(run / EVALUATION), "evaluation", [*REPORT, *FIGURES])
+        except ConfigError as error:  # the run is complete, whatever is in the way there
+            say(f"warning: {error}")
+            return
         files = write_report(folder, [row], options.paper, circumstances(options, policy, self._overrides))
         target = (saved.config.landing_target[0], saved.config.landing_target[1])
         files += write_figures(folder, [row], saved.config.ball.table, target, self.config.warmup_serves)
-        tell(task_line("table", saved.config, policy.config))
-        tell(closing_table(row.summary, options.paper))
         tell(f"wrote {folder}: {', '.join(file.name for file in files)}")
 
 

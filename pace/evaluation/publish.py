@@ -8,6 +8,7 @@ evaluation and of a sweep, and a model card (README.md).
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import tempfile
 from pathlib import Path
@@ -16,12 +17,14 @@ from omegaconf import DictConfig
 
 from pace.config.base import parse
 from pace.config.commands import KeepConfig
-from pace.evaluation.card import CARD, card
+from pace.evaluation.card import CARD, FIRST_ROW, card
 from pace.rl.policies import locate
 from pace.runs.checkpoint import META, WEIGHTS, CheckpointError, export_weights, find_checkpoint
 from pace.runs.checkpoint_folders import FOLDER
 from pace.runs.files import write_whole
 from pace.runs.metrics import write_slim
+from pace.runs.own_files import LIST, listed, note
+from pace.runs.own_files import require_own as require_own_files
 from pace.runs.run_folder import METRICS
 
 RUN_FILES = ("learning_curve.png", "versions.json")
@@ -70,9 +73,25 @@ def keep(run: Path, folder: Path, evaluation: Path | None = None, notes: str = "
         written = write_policy(fresh, checkpoint, evaluation, notes)
         if folder.is_dir():
             copy_others(folder, fresh)
-            folder.rename(Path(scratch) / "old")
-        fresh.rename(folder)
+        replace_folder(folder, fresh)
     return [folder / name for name in written]
+
+
+def replace_folder(folder: Path, fresh: Path) -> None:
+    """Give ``fresh`` the name ``folder``; what was there is put back if that fails or is interrupted.
+
+    Until then it has a hidden name beside ``folder``, where a kill leaves it.
+    """
+    old = folder.with_name(f".{folder.resolve().name}.{os.getpid()}.old")
+    try:
+        if folder.exists():
+            folder.rename(old)
+        fresh.rename(folder)
+    except BaseException:  # Ctrl-C, too
+        if old.exists() and not folder.exists():
+            old.rename(folder)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
 
 
 def require_own(folder: Path, run: Path, checkpoint: Path) -> None:
@@ -84,15 +103,23 @@ def require_own(folder: Path, run: Path, checkpoint: Path) -> None:
         raise KeepError(f"{folder} is no folder: give a new one, such as pretrained/mine")
     if folder.is_dir() and any(folder.iterdir()) and not is_published(folder):
         raise KeepError(f"{folder} holds other files, which are not replaced: give a new folder, such as {folder}/mine")
+    if CARD in listed(folder):
+        require_own_files(folder, FILES)
 
 
 def is_published(folder: Path) -> bool:
-    """Whether this module wrote ``folder``: it holds a card, and a checkpoint that has weights only."""
+    """Whether this module wrote ``folder``, by its list of files; of before there was one, by the card and a
+    checkpoint that has weights only."""
+    if {CARD, META, WEIGHTS} <= listed(folder):
+        return True
     if not all((folder / name).is_file() for name in (CARD, META, WEIGHTS)):
         return False
     try:
         meta = json.loads((folder / META).read_text(encoding="utf-8"))
+        text = (folder / CARD).read_text(encoding="utf-8")
     except ValueError:
+        return False
+    if FIRST_ROW not in text:
         return False
     return isinstance(meta, dict) and "config" in meta and meta.get("training") is None
 
@@ -110,13 +137,18 @@ def write_policy(folder: Path, checkpoint: Path, evaluation: Path | None, notes:
     if (run / METRICS).is_file():
         (write_slim if of_a_run else shutil.copyfile)(run / METRICS, folder / METRICS)
     write_whole(folder / CARD, card(folder, notes))
-    return sorted(file.name for file in folder.iterdir())
+    names = sorted(file.name for file in folder.iterdir())
+    note(folder, names)
+    return names
 
 
 def copy_others(old: Path, fresh: Path) -> None:
-    """Copy the files of ``old`` that are not of this module into ``fresh``."""
+    """Copy the files of ``old`` that are not of this module into ``fresh``, with what its list says of them."""
+    others = listed(old).difference(FILES)
+    if others:
+        note(fresh, sorted(others))
     for entry in old.iterdir():
-        if entry.name in FILES:
+        if entry.name in (*FILES, LIST):
             continue
         if entry.is_dir() and not entry.is_symlink():
             shutil.copytree(entry, fresh / entry.name, symlinks=True)

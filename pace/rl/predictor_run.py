@@ -22,7 +22,8 @@ from pace.predictor.priors import resolve_priors
 from pace.predictor.regression import PredictorTrainer
 from pace.rl.practice import ServePractice
 from pace.runs.checkpoint import Checkpoint
-from pace.runs.interrupt import StopRequest
+from pace.runs.files import write_whole
+from pace.runs.interrupt import StopRequest, terminable
 from pace.runs.optimiser import learning_rate
 from pace.runs.progress import Progress
 from pace.runs.run_folder import METRICS, RunFolder
@@ -97,9 +98,19 @@ class PredictorRun:
 def train_predictor(composed: DictConfig) -> None:
     """Train as the composed configuration says, and print what was written."""
     config = parse(composed, TrainConfig)
-    session = PredictorRun(config)
-    run = RunFolder(config.out, to_dict(config), config.tensorboard)
+    run = RunFolder(config.out, to_dict(config), config.tensorboard, files=[RESULT])  # before the first second of work
     config.out = str(run.path)
+    try:
+        with terminable():
+            _train(config, run)
+    except BaseException:
+        run.abandon()
+        raise
+
+
+def _train(config: TrainConfig, run: RunFolder) -> None:
+    session = PredictorRun(config)
+    run.configure(to_dict(config))
     print(f"training the predictor on serves in {config.num_worlds} worlds, run folder {run.path}", flush=True)
     counters = session.train(run)
     errors = session.measure()
@@ -107,7 +118,7 @@ def train_predictor(composed: DictConfig) -> None:
     folder = run.save(int(counters["updates"]), Checkpoint(to_dict(config), counters, weights, None), last=True)
     run.close()
     result = {"errors": errors, "counters": counters, "ball": config.ball.name, "serve": config.serve.name}
-    (run.path / RESULT).write_text(json.dumps(result, indent=1), encoding="utf-8")
+    write_whole(run.path / RESULT, json.dumps(result, indent=1))
     for name, value in errors.items():
         print(f"{name}: {value:.2f}")
     for file in (folder, run.path / RESULT, run.path / METRICS):

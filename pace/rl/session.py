@@ -25,7 +25,15 @@ from pace.config.schedules import START, position_of
 from pace.config.training import RESUME_KEYS, TrainConfig
 from pace.cores import threads_of
 from pace.devices import has_bf16, machine_of, resolve_device
-from pace.distributed import ProcessGroup, is_first_here, launched_size, own_device, process_group, suitable_size
+from pace.distributed import (
+    ProcessGroup,
+    is_first_here,
+    is_rank_0,
+    launched_size,
+    own_device,
+    process_group,
+    suitable_size,
+)
 from pace.memory import available_memory
 from pace.predictor.network import BallPredictor, make_predictor
 from pace.predictor.priors import resolve_priors
@@ -38,9 +46,10 @@ from pace.rl.trainer import Summary, Trainer, device_type_of, restarts_worlds
 from pace.runs.checkpoint import Checkpoint, CheckpointError, load_checkpoint
 from pace.runs.checkpoint_folders import FOLDER, NAME
 from pace.runs.files import tell
+from pace.runs.interrupt import terminable
 from pace.runs.learning_curve import CURVE
 from pace.runs.progress import rate_texts
-from pace.runs.run_folder import METRICS, RunFolder, is_run
+from pace.runs.run_folder import EVALUATION, FILM, METRICS, RunFolder, is_run
 
 if TYPE_CHECKING:
     from pace.task.env import TableTennisEnv
@@ -55,11 +64,18 @@ SEEDS_APART = 1_000_003  # between the stages of a curriculum: further than seed
 def train_from_config(composed: DictConfig, make_judge: MakeJudge | None = None, film: Film | None = None) -> None:
     """Train as the composed configuration says, and print what was written.
 
-    A run that comes to its end is judged by what ``make_judge`` makes, and filmed.
+    A run that comes to its end is judged by what ``make_judge`` makes, and filmed. Its folder is claimed before
+    the work begins; a new folder is removed if the run cannot start.
+
+    Errors: :class:`Terminated` for a SIGTERM or SIGHUP, whatever the run is doing; what is saved can be resumed.
     """
+    with terminable():
+        _train(composed, make_judge, film)
+
+
+def _train(composed: DictConfig, make_judge: MakeJudge | None, film: Film | None) -> None:
     config = parse(composed, TrainConfig)
-    hydra = HydraConfig.get()
-    overrides = list(hydra.overrides.task)
+    overrides = list(HydraConfig.get().overrides.task)
     if config.resume:
         saved = load_checkpoint(locate(config.resume))
         config = resumed_config(saved, config.resume, overrides)
@@ -72,24 +88,43 @@ def train_from_config(composed: DictConfig, make_judge: MakeJudge | None = None,
     else:
         chosen = adapt(config, saved, device, overrides)
     config.processes = config.processes or suitable_size(config.num_worlds, device)
-    if is_first_here():
-        if device.type == "cpu" and launched_size() == 1:
-            automatic.require_memory(config.num_worlds, config.processes, available_memory())
-        warm(config, device)  # before any clock runs, and once for all processes of this machine
-    # a job of a sweep, which a launcher may have started by another program; the command's arguments are of all jobs
-    command = ["-m", COMMAND, *overrides] if hydra.mode == RunMode.MULTIRUN else None
-    with process_group(config.processes, device, command) as group:
-        trainer = build_trainer(config, saved, device, group)
-        if trainer.run is not None:
-            announce(trainer, trainer.run, saved, chosen)
-            trainer.judge = make_judge(config.judge) if make_judge else None
-        summary = trainer.train()
+    run = open_run(config, int(saved.counters["updates"]) if saved else 0) if is_rank_0() else None
+    try:
+        summary, trainer = train_run(config, saved, device, run, make_judge, chosen)
+    except BaseException:
+        if run is not None:
+            run.abandon()
+        raise
     if summary is None:
         return
     report(summary)
     trainer.stop.require_not_terminated()
     if trainer.judge is not None and trainer.stop.name is None:
         close(trainer.judge, film, summary, config.judge)
+
+
+def train_run(
+    config: TrainConfig,
+    saved: Checkpoint | None,
+    device: torch.device,
+    run: RunFolder | None,
+    make_judge: MakeJudge | None,
+    chosen: dict[str, Any],
+) -> tuple[Summary | None, Trainer]:
+    """Compile, start the process group and train in it. The summary and the ``run`` folder are those of rank 0."""
+    if is_first_here():
+        if device.type == "cpu" and launched_size() == 1:
+            automatic.require_memory(config.num_worlds, config.processes, available_memory())
+        warm(config, device)  # before any clock runs, and once for all processes of this machine
+    # a job of a sweep, which a launcher may have started by another program; the command's arguments are of all jobs
+    hydra = HydraConfig.get()
+    command = ["-m", COMMAND, *hydra.overrides.task] if hydra.mode == RunMode.MULTIRUN else None
+    with process_group(config.processes, device, command) as group:
+        trainer = build_trainer(config, saved, device, group, run)
+        if run is not None:
+            announce(trainer, run, saved, chosen)
+            trainer.judge = make_judge(config.judge) if make_judge else None
+        return trainer.train(), trainer
 
 
 def close(judge: Judge, film: Film | None, summary: Summary, config: JudgeConfig) -> None:
@@ -167,8 +202,11 @@ def run_of(checkpoint: Path | None) -> Path | None:
     return folder if is_run(folder) else None
 
 
-def build_trainer(config: TrainConfig, saved: Checkpoint | None, device: torch.device, group: ProcessGroup) -> Trainer:
-    """Networks, this process's worlds and (on rank 0) the run folder; state from ``saved`` or :func:`first_weights`.
+def build_trainer(
+    config: TrainConfig, saved: Checkpoint | None, device: torch.device, group: ProcessGroup, run: RunFolder | None
+) -> Trainer:
+    """Networks and this process's worlds, with the ``run`` folder (of rank 0); state from ``saved`` or
+    :func:`first_weights`.
 
     Errors: :class:`ConfigError` if the process group cannot share the worlds equally.
     """
@@ -176,23 +214,8 @@ def build_trainer(config: TrainConfig, saved: Checkpoint | None, device: torch.d
         raise ConfigError(f"num_worlds {config.num_worlds} cannot be shared equally by {group.size} processes")
     start = first_weights(config)
     config.predictor = resolve_priors(config, learned_priors(start) if start else None)
-    run = open_run(config, int(saved.counters["updates"]) if saved else 0) if group.is_rank_0 else None
-    try:
-        return _build(config, saved, start, device, group, run)
-    except BaseException:
-        if run is not None:
-            run.abandon()
-        raise
-
-
-def _build(
-    config: TrainConfig,
-    saved: Checkpoint | None,
-    start: Checkpoint | None,
-    device: torch.device,
-    group: ProcessGroup,
-    run: RunFolder | None,
-) -> Trainer:
+    if run is not None:
+        run.configure(to_dict(config))
     torch.manual_seed(config.seed)
     predictor = make_predictor(config.predictor).to(device)
     new_worlds = saved is not None and restarts_worlds(saved, group, device)
@@ -252,7 +275,7 @@ def learned_priors(start: Checkpoint) -> PredictorPriors:
 
 def open_run(config: TrainConfig, first_update: int) -> RunFolder:
     """The run folder that ``config`` names, or a new one, whose path ``config`` then holds."""
-    run = RunFolder(config.out, to_dict(config), config.tensorboard, first_update)
+    run = RunFolder(config.out, to_dict(config), config.tensorboard, first_update, (FILM, EVALUATION))
     config.out = str(run.path)
     return run
 

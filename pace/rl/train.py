@@ -35,10 +35,11 @@ def _judge(config: JudgeConfig) -> Judge:
 def _film(run: Path, seconds: float) -> None:
     """Film the newest policy of ``run`` for so long, s, or say what is missing for that."""
     from pace.runs.files import tell
+    from pace.runs.run_folder import FILM
     from pace.sim.render import RenderError
     from pace.viewer.play import film_run
 
-    file = run / "play.mp4"
+    file = run / FILM
     try:
         film_run(run, file, seconds)
     except RenderError as error:

@@ -123,7 +123,7 @@ class Trainer:
                     if self.run is not None:
                         self.run.log(row)
                     self._measure(now - started, progress)
-                    reason, due = self.group.broadcast_object((self._reason_to_end(now - started), self._save_is_due()))
+                    reason, due = self._asked(now - started)
                     if (due and not self._recovery.in_a_row) or reason is not None:
                         newest = self.save(last=reason is not None)
                     judged = self._judge(newest) if due and reason is None else {}
@@ -191,9 +191,18 @@ class Trainer:
         if said and self.group.is_rank_0:
             progress.say(said)
 
+    def _asked(self, seconds: float) -> tuple[str | None, bool]:
+        """Why the run ends now, if it does, and whether a checkpoint is due, as rank 0 says; a signal to any rank ends
+        the run."""
+        asked = self.group.gather((self.stop.name, self._reason_to_end(seconds), self._save_is_due()))
+        _, reason, due = asked[0]
+        signal = next((name for name, *_ in asked if name is not None), None)
+        if signal is None:
+            return reason, due
+        self.stop.name = signal
+        return f"stopped by {signal}", due
+
     def _reason_to_end(self, seconds: float) -> str | None:
-        if self.stop.name is not None:
-            return f"stopped by {self.stop.name}"
         if self.samples >= self.config.samples:
             return f"samples={self.config.samples:g} reached"
         if 0 < 60.0 * self.config.minutes <= seconds:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from types import FrameType
+from typing import Any
 
 from pace.command import Terminated
 
+Handler = Callable[[int, FrameType | None], Any] | int | None
 SIGNALS = (signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
 
 
@@ -28,24 +31,51 @@ class StopRequest:
 
     @contextmanager
     def listening(self) -> Iterator[None]:
-        """Handle the signals while the block runs; a second one acts as it would without this class."""
+        """Handle the signals while the block runs.
+
+        A second Ctrl-C acts as it would without this class. A scheduler may send SIGTERM again while the work is saved:
+        that, and SIGHUP, change nothing.
+        """
         if threading.current_thread() is not threading.main_thread():
             yield
             return
         before = {number: signal.getsignal(number) for number in SIGNALS}
         before = {number: handler for number, handler in before.items() if handler != signal.SIG_IGN}
 
-        def give_back() -> None:
-            for number, handler in before.items():
-                signal.signal(number, handler)
-
         def on_signal(number: int, _frame: object) -> None:
-            self.name = signal.Signals(number).name
-            give_back()
+            self.name = self.name or signal.Signals(number).name
+            if signal.SIGINT in before:
+                signal.signal(signal.SIGINT, before[signal.SIGINT])
 
-        for number in before:
-            signal.signal(number, on_signal)
-        try:
+        with _handled(before, on_signal):
             yield
-        finally:
-            give_back()
+
+
+@contextmanager
+def terminable() -> Iterator[None]:
+    """The first SIGTERM or SIGHUP in the block raises :class:`Terminated`, which cleans up; later ones are ignored."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.getsignal(number) for number in SIGNALS[1:]}
+    before = {number: handler for number, handler in before.items() if handler != signal.SIG_IGN}
+
+    def on_signal(_number: int, _frame: object) -> None:
+        for number in before:
+            signal.signal(number, lambda *_: None)  # not SIG_IGN, which processes that are started would inherit
+        raise Terminated
+
+    with _handled(before, on_signal):
+        yield
+
+
+@contextmanager
+def _handled(before: Mapping[signal.Signals, Handler], on_signal: Callable[[int, object], None]) -> Iterator[None]:
+    """``on_signal`` for those signals; their handlers ``before`` are put back at the end."""
+    for number in before:
+        signal.signal(number, on_signal)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

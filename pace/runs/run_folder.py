@@ -7,12 +7,9 @@ import platform
 import re
 import subprocess
 import sys
-import tempfile
-import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -26,55 +23,19 @@ from pace.config.upgrade import FORMAT
 from pace.runs.checkpoint import Checkpoint, CheckpointError, save_checkpoint
 from pace.runs.checkpoint_folders import FOLDER, clear_leftovers, list_checkpoints, prune_checkpoints, update_of
 from pace.runs.files import reason, say, write_whole
-from pace.runs.metrics_file import FIRST_COLUMN, EventsFile, MetricsFile
-from pace.runs.own_files import claim
+from pace.runs.learning_curve import CURVE
+from pace.runs.metrics_file import EventsFile, MetricsFile
+from pace.runs.own_files import listed, make_out, note, remove_unused, require_own
 
 STAMP = "# format: "  # begins the first line of a run's configuration
 LOCK = ".lock"
 CHECKPOINTS_KEPT = 4
 REPLAYS, REPLAY_SUFFIX, MOST_REPLAYS = "replays", ".replay", 16
 CONFIG, VERSIONS, METRICS, EVENTS = "config.yaml", "versions.json", "metrics.csv", "events"
+FILM, EVALUATION = "play.mp4", "evaluation"  # of a training run that has come to its end
+FILES = (CONFIG, VERSIONS, METRICS, CURVE)  # of every run
 PACKAGES = ("torch", "torchrl", "tensordict", "mujoco", "mujoco-warp", "warp-lang", "numpy", "hydra-core")
 LEFTOVER = re.compile(r"\.(config\.yaml|versions\.json|metrics\.csv)\.\d+\.tmp")  # of a kill while a file was written
-
-
-def new_folder(name: str) -> Path:
-    """Make ``runs/<date>_<name>``, with a number if that exists: of two commands in one second, each gets its own.
-
-    Errors: ``OSError``.
-    """
-    base = Path("runs") / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}_{name}"
-    base.parent.mkdir(parents=True, exist_ok=True)
-    for number in count(1):
-        folder = base if number == 1 else base.with_name(f"{base.name}_{number}")
-        with suppress(FileExistsError):
-            folder.mkdir()
-            return folder
-    raise AssertionError("count() does not end")
-
-
-def make_out(out: str | None, name: str, files: Sequence[str] = ()) -> Path:
-    """The folder that a command writes: ``out``, or a :func:`new_folder`. Made before the work begins.
-
-    ``files`` are those that it will write there (:func:`pace.runs.own_files.claim`).
-
-    Errors: :class:`ConfigError` for a folder that cannot be made or written, or holds other files of these names.
-    """
-    folder = Path(out) if out else Path("runs")
-    try:
-        if out:
-            folder.mkdir(parents=True, exist_ok=True)
-        else:
-            folder = new_folder(name)
-    except (OSError, ValueError) as error:  # ValueError: a path with a zero byte
-        raise ConfigError(f"out={folder} cannot be made: {reason(error)}") from error
-    try:
-        tempfile.TemporaryFile(dir=folder).close()
-    except OSError as error:
-        raise ConfigError(f"out={folder} cannot be written: {reason(error)}") from error
-    if files:
-        claim(folder, files)
-    return folder
 
 
 def versions() -> dict[str, Any]:
@@ -116,17 +77,25 @@ class RunFolder:
     The folder is made and claimed at once; :meth:`begin` writes into it. Rows that a crashed run logged after
     ``first_update``, its last checkpoint, are dropped then.
 
-    Args: path: ``None`` is a :func:`new_folder` of the configuration's ``name``.
+    Args: path: ``None`` is a :func:`pace.runs.own_files.new_folder` of the configuration's ``name``. ``files``: names
+    that the command writes there besides :data:`FILES`.
     Errors: :class:`ConfigError` for a folder that cannot be made, that another process owns, or that holds a later
-    checkpoint.
+    checkpoint or somebody else's files of these names.
     """
 
     def __init__(
-        self, path: str | Path | None, config: dict[str, Any], tensorboard: bool, first_update: int = 0
+        self,
+        path: str | Path | None,
+        config: dict[str, Any],
+        tensorboard: bool,
+        first_update: int = 0,
+        files: Sequence[str] = (),
     ) -> None:
         self._made = path is None or not Path(path).exists()
         self.path = make_out(None if path is None else str(path), str(config.get("name", "")))
         self._config, self._first_update = config if path else config | {"out": str(self.path)}, first_update
+        self._files = (*FILES, *files)
+        self._require_own()
         self._lock = FileLock(self.path / LOCK)  # the system releases it when the process ends, for whatever reason
         self._claim()
         self._tensorboard = tensorboard
@@ -143,7 +112,6 @@ class RunFolder:
             ) from error
         except OSError as error:  # a file system without locks
             say(f"warning: {self.path} cannot be locked ({reason(error)}): do not train another run in it")
-        self._require_own()
         last = max((update_of(folder) for folder in list_checkpoints(self.path)), default=0)
         if last > self._first_update:
             raise ConfigError(
@@ -153,14 +121,13 @@ class RunFolder:
 
     def _require_own(self) -> None:
         """The files that a run replaces must be a run's. Errors: :class:`ConfigError` for somebody else's."""
-        config, metrics = self.path / CONFIG, self.path / METRICS
-        ours = [
-            not config.exists() or is_run(self.path),
-            not metrics.exists() or metrics.stat().st_size == 0 or _first_line(metrics).startswith(FIRST_COLUMN),
-        ]
-        for file, own in zip((config, metrics), ours, strict=True):
-            if not own:
-                raise ConfigError(f"{file} is no file of a run, and is not replaced: give another out=")
+        if is_run(self.path) and CONFIG not in listed(self.path):
+            return  # of before there was a list
+        require_own(self.path, self._files)
+
+    def configure(self, config: dict[str, Any]) -> None:
+        """Replace the configuration that :meth:`begin` writes, by what became known since the folder was made."""
+        self._config = config
 
     def begin(self) -> None:
         """Write configuration and versions, and open the logs; :meth:`log` does so if this was not called.
@@ -183,7 +150,8 @@ class RunFolder:
             self._events = EventsFile(self.path / EVENTS, first)
 
     def _describe(self) -> None:
-        """Write configuration and versions."""
+        """Write configuration and versions, and note all names as the run's own."""
+        note(self.path, self._files)
         write_whole(self.path / CONFIG, f"{STAMP}{FORMAT}\n{OmegaConf.to_yaml(OmegaConf.create(self._config))}")
         write_whole(self.path / VERSIONS, json.dumps(versions(), indent=1))
 
@@ -254,9 +222,7 @@ class RunFolder:
         """Release the folder of a run that could not start; a new one is removed."""
         self.close()
         if self._made and self._metrics is None:
-            with suppress(OSError):  # somebody else has put something there
-                (self.path / LOCK).unlink(missing_ok=True)
-                self.path.rmdir()
+            remove_unused(self.path, (LOCK,))
 
 
 def is_run(folder: Path) -> bool:

@@ -18,8 +18,9 @@ from omegaconf import DictConfig
 from pace.config.base import parse
 from pace.config.commands import AblateConfig
 from pace.runs.metrics import MILESTONES, Array, Curve, Milestone, markdown, passage, read_curve, write_slim
+from pace.runs.own_files import make_out
 from pace.runs.queue import Run, RunQueue, check_settings
-from pace.runs.run_folder import METRICS, make_out
+from pace.runs.run_folder import METRICS
 
 DPI = 110
 COLOURS, DASHES = 10, ("-", "--", ":")  # of the figure: the next dash after the last colour

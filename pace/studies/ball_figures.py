@@ -17,7 +17,7 @@ from torch import Tensor
 from pace.arrays.launch import Launch
 from pace.config.base import parse
 from pace.config.commands import ValidateConfig
-from pace.runs.run_folder import make_out
+from pace.runs.own_files import make_out
 from pace.sim.ball.ball import BallParams, BallSim, Forecast, ball_preset
 from pace.sim.ball.rebound import Material, rebound
 from pace.studies import ball_reference as reference

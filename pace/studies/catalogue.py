@@ -16,7 +16,7 @@ from omegaconf import DictConfig
 from pace.config.base import meant, parse, require
 from pace.config.commands import StudiesConfig
 from pace.rl.policies import load_policy, load_predictor
-from pace.runs.run_folder import make_out
+from pace.runs.own_files import make_out
 from pace.studies import (
     adaptation,
     ankles,

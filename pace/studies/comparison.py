@@ -24,7 +24,8 @@ from pace.evaluation.text import Table, markdown_table, number, text_table
 from pace.rl.policies import TaskPolicy, load_policy
 from pace.runs.files import write_whole
 from pace.runs.metrics import MILESTONES, Curve, passage, read_curve
-from pace.runs.run_folder import make_out, versions
+from pace.runs.own_files import make_out
+from pace.runs.run_folder import versions
 from pace.studies.ablation import SHOWN_RATES, Curves, draw, needed
 from pace.studies.run_groups import Given, differences, group_runs, read_run
 

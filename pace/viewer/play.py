@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 from omegaconf import DictConfig
@@ -12,8 +13,9 @@ from pace.config.base import ConfigError, compose, parse
 from pace.config.commands import PlayConfig
 from pace.evaluation.sweep import ball_presets
 from pace.rl.policies import TaskPolicy, load_policy
+from pace.runs.own_files import started_out
 from pace.runs.progress import SECONDS_PER_LINE
-from pace.runs.run_folder import REPLAY_SUFFIX, make_out
+from pace.runs.run_folder import REPLAY_SUFFIX
 from pace.viewer.playback import Show
 from pace.viewer.replay import ReplayPage, load_show
 from pace.viewer.server import require_viewer
@@ -31,9 +33,16 @@ def play_from_config(composed: DictConfig) -> None:
     policy = load_policy(config.run)
     overrides = [f"engine.physics_dt={config.physics_dt}", *config.overrides]
     if config.video:
-        film(config, Show(policy, overrides, config.seed), f"policy {policy.source}")
+        with place_of(config.video):  # before the worlds are made, which may compile
+            film(config, Show(policy, overrides, config.seed), f"policy {policy.source}")
     else:
         page(config, policy, overrides)
+
+
+def place_of(video: str) -> AbstractContextManager[Path]:
+    """The folder of a video, claimed for it; one that is made and not used is removed."""
+    file = Path(video)
+    return started_out(str(file.parent), "video", [file.name])
 
 
 def page(config: PlayConfig, policy: TaskPolicy, overrides: list[str]) -> None:
@@ -53,7 +62,8 @@ def replay(config: PlayConfig) -> None:
         raise ConfigError("a replay shows what was: it takes no changes of the task")
     show = load_show(Path(config.run))
     if config.video:
-        film(config, show, f"replay {config.run}")
+        with place_of(config.video):
+            film(config, show, f"replay {config.run}")
         return
     require_viewer()
     shown = ReplayPage(show, config.host, config.port)
@@ -68,7 +78,6 @@ def film(config: PlayConfig, show: Shown, about: str) -> None:
     """Write the video."""
     assert config.video
     file = Path(config.video)
-    make_out(str(file.parent), "video", [file.name])
     total = round(config.seconds * config.fps / config.speed)
     size = (config.width, config.height)
     interval = 0.2 if sys.stderr.isatty() else SECONDS_PER_LINE

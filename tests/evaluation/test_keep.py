@@ -9,10 +9,13 @@ from pathlib import Path
 import pytest
 import torch
 
+from pace.config.base import ConfigError
 from pace.evaluation import publish
 from pace.evaluation.keep import main
 from pace.evaluation.publish import KeepError, keep
 from pace.rl.policies import load_policy
+from pace.runs.checkpoint import export_weights
+from pace.runs.own_files import LIST
 from tests.helpers.saved import save_run
 
 ROW = {"serve": "mid_long", "serves": 5120, "hit": 0.995, "hit_low": 0.991, "hit_high": 0.997}
@@ -44,7 +47,8 @@ def test_the_kept_policy_acts_like_the_run(
     assert "metrics.csv" in capsys.readouterr().out
     names = {file.name for file in kept.iterdir()}
     files = {"checkpoint.json", "weights.safetensors", "metrics.csv", "evaluation.json", "sweep.json", "README.md"}
-    assert names == files | {"versions.json"} & names
+    assert names == files | {LIST} | {"versions.json"} & names
+    assert set((kept / LIST).read_text().split()) == names - {LIST}
     before, after = load_policy(run), load_policy(kept)
     observation = torch.randn(5, 450)
     torch.testing.assert_close(after(observation), before(observation), atol=1e-6, rtol=0)
@@ -191,6 +195,48 @@ def test_a_policy_that_cannot_be_finished_changes_nothing(tmp_path: Path, monkey
     with pytest.raises(OSError, match="disk is full"):
         keep(run, tmp_path / "kept")
     assert files_of(tmp_path) == before
+
+
+@pytest.mark.parametrize("error", [OSError("disk is full"), KeyboardInterrupt()])
+def test_a_folder_that_cannot_be_replaced_is_put_back(
+    error: BaseException, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second of the two renames fails; or Ctrl-C comes between them."""
+    run = save_run(tmp_path / "run")
+    keep(run, tmp_path / "kept", notes="Old note.")
+    (tmp_path / "kept" / "notes.txt").write_text("mine")
+    before, rename = files_of(tmp_path), Path.rename
+
+    def fails(self: Path, target: Path) -> Path:
+        if self.name == "kept" and target.name == "kept":
+            assert not target.exists()
+            raise error
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", fails)
+    with pytest.raises(type(error)):
+        keep(run, tmp_path / "kept")
+    assert files_of(tmp_path) == before
+    monkeypatch.undo()
+    keep(run, tmp_path / "kept")
+    assert {path.name for path in tmp_path.iterdir()} == {"run", "kept"}
+
+
+def test_a_strangers_folder_is_no_published_policy_and_files_in_one_are_the_users(tmp_path: Path) -> None:
+    run, theirs = save_run(tmp_path / "run"), tmp_path / "theirs"
+    export_weights(run, theirs)
+    (theirs / "README.md").write_text("# The policy of my thesis\n")
+    before = files_of(theirs)
+    with pytest.raises(KeepError, match="holds other files"):
+        keep(run, theirs)
+    assert files_of(theirs) == before
+    keep(run, tmp_path / "kept")
+    (tmp_path / "kept" / "sweep.json").write_text("mine")
+    with pytest.raises(ConfigError, match=r"sweep.json is no file that pace has written"):
+        keep(run, tmp_path / "kept")
+    (tmp_path / "kept" / "sweep.json").unlink()
+    (tmp_path / "kept" / "README.md").write_text("written again by hand")  # it stays a published policy
+    keep(run, tmp_path / "kept")
 
 
 def test_an_empty_folder_may_be_written(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -12,13 +14,16 @@ from pace.bench.__main__ import main as bench
 from pace.config.base import ConfigError
 from pace.deploy.__main__ import main as export
 from pace.evaluation.__main__ import main as evaluate
+from pace.predictor.__main__ import main as predictor
+from pace.rl import predictor_run, session
 from pace.rl.train import main as train
-from pace.runs.own_files import LIST
-from pace.runs.run_folder import RunFolder, make_out
+from pace.runs.own_files import LIST, make_out
+from pace.runs.run_folder import STAMP, RunFolder
 from pace.studies.__main__ import main as studies
 from pace.studies.ablate import main as ablate
 from pace.studies.ball import main as validate
 from pace.studies.compare import main as compare
+from pace.viewer import play as viewer_play
 from pace.viewer.__main__ import main as play
 from tests.helpers.outside import SMALL, command
 
@@ -81,14 +86,15 @@ def test_an_out_that_cannot_be_a_folder_ends_in_one_line_before_the_work(
 @pytest.mark.parametrize(
     ("name", "text"),
     [("config.yaml", "my: own settings\n"), ("config.yaml", "- a\n- list\n"), ("config.yaml", "{"),
-     ("metrics.csv", "day,weight\n1,70\n")],
+     ("metrics.csv", "day,weight\n1,70\n"), ("metrics.csv", ""), ("versions.json", '{"packages": {}}'),
+     ("learning_curve.png", "picture"), ("film.mp4", "film")],
 )  # fmt: skip
 def test_a_run_replaces_no_file_that_is_not_a_runs(name: str, text: str, tmp_path: Path) -> None:
     (tmp_path / name).write_text(text)
-    with pytest.raises(ConfigError, match=f"{name} is no file of a run, and is not replaced"):
-        RunFolder(tmp_path, {"robot": {}, "algo": {}}, tensorboard=False)
+    with pytest.raises(ConfigError, match=f"{name} is no file that pace has written there, and is not replaced"):
+        RunFolder(tmp_path, {"robot": {}, "algo": {}}, tensorboard=False, files=["film.mp4"])
     assert (tmp_path / name).read_text() == text
-    assert {file.name for file in tmp_path.iterdir()} <= {name, ".lock"}
+    assert [file.name for file in tmp_path.iterdir()] == [name]
 
 
 def test_a_run_may_begin_again_in_its_own_folder(tmp_path: Path) -> None:
@@ -98,10 +104,61 @@ def test_a_run_may_begin_again_in_its_own_folder(tmp_path: Path) -> None:
         run.close()
 
 
+def test_a_run_of_before_there_was_a_list_may_begin_again(tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_text(f"{STAMP}4\nrobot: {{}}\nalgo: {{}}\n")
+    make_out(str(tmp_path), "x", ["page.md"])  # another command has written a list there
+    for name in ("versions.json", "metrics.csv", "film.mp4"):
+        (tmp_path / name).write_text("")
+    run = RunFolder(tmp_path, {"robot": {}, "algo": {}}, tensorboard=False, files=["film.mp4"])
+    run.log({"update": 1.0})
+    run.close()
+    written = {"config.yaml", "versions.json", "metrics.csv", "learning_curve.png", "film.mp4", "page.md"}
+    assert set((tmp_path / LIST).read_text().split()) == written
+
+
+def test_a_run_has_its_folder_before_the_work_and_leaves_none_if_it_ends_at_its_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The kernels are compiled first, which takes minutes; a SIGTERM then ends the command with its status."""
+    warmed: list[bool] = []
+
+    def terminated(*_: object) -> None:
+        warmed.append((tmp_path / "run" / ".lock").exists())
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(session, "warm", terminated)
+    before = signal.getsignal(signal.SIGTERM)
+    assert command(train, *SMALL, "processes=1", f"out={tmp_path / 'run'}") == 75
+    assert warmed == [True]
+    assert list(tmp_path.iterdir()) == []
+    assert signal.getsignal(signal.SIGTERM) == before
+    (tmp_path / "taken").write_text("mine")
+    assert command(train, *SMALL, "processes=1", f"out={tmp_path / 'taken'}") == 2
+    assert len(warmed) == 1
+    assert "cannot be made" in capsys.readouterr().err
+
+
+def test_a_predictor_and_a_video_have_their_folder_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[bool] = []
+
+    def fails(*_: object) -> None:
+        made.append((tmp_path / "new").is_dir())
+        raise ConfigError("no such task")
+
+    monkeypatch.setattr(predictor_run, "PredictorRun", fails)
+    monkeypatch.setattr(viewer_play, "Show", fails)
+    assert command(predictor, f"out={tmp_path / 'new'}") == 2
+    assert command(play, "pretrained/pace", "--video", f"{tmp_path / 'new' / 'film.mp4'}") == 2
+    assert made == [True, True]
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_the_command_names_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "metrics.csv").write_text("day,weight\n1,70\n")
     assert command(train, f"out={tmp_path}", *SMALL) == 2
-    assert f"{tmp_path / 'metrics.csv'} is no file of a run" in capsys.readouterr().err
+    assert f"{tmp_path / 'metrics.csv'} is no file that pace has written there" in capsys.readouterr().err
 
 
 def test_files_of_others_are_not_replaced_and_own_ones_are(tmp_path: Path) -> None:
@@ -164,6 +221,11 @@ FEW += tuple(f"variations.{name}=[]" for name in ("noise", "latency", "friction"
         (compare, ("docs/results/recipe/steps_12_seed1.csv",), "compare.md"),
         (validate, (), "presets.png"),
         (play, ("pretrained/pace", "--video", "{folder}/film.mp4"), "film.mp4"),
+        (train, SMALL, "versions.json"),
+        (train, SMALL, "learning_curve.png"),
+        (train, SMALL, "play.mp4"),
+        (train, SMALL, "evaluation"),
+        (predictor, (), "predictor.json"),
     ],
 )
 def test_every_command_asks_before_its_work(
