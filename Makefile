@@ -36,6 +36,8 @@ bench: venv  ## measure speed and memory: python -m pace.bench $(ARGS)
 	$(BIN)/python -m pace.bench $(ARGS)
 
 # The stamp holds what was installed; it is compared by content, since a checkout changes the times of files.
+# A CPU build of torch comes first, if pip is told where one lies: of files without a hash in their address pip takes none
+# as long as there is another.
 venv:  ## make or renew .venv from requirements.lock
 	@set -e; \
 	if cat requirements.lock pyproject.toml | cmp -s - $(VENV)/.installed && $(BIN)/python -c "" 2>/dev/null; then exit 0; fi; \
@@ -53,21 +55,35 @@ venv:  ## make or renew .venv from requirements.lock
 	  $$python -m venv --clear $(VENV); \
 	fi; \
 	echo "== installing requirements.lock into $(VENV): a few minutes, once"; \
-	$(BIN)/python -m pip install --disable-pip-version-check -r requirements.lock; \
+	sed -n 's/^torch==[0-9.]*/&+cpu/; /^torch==/,/[^\\]$$/p' requirements.lock > $(VENV)/torch-cpu.txt; \
+	$(BIN)/python -m pip install --quiet --require-hashes --no-deps -r $(VENV)/torch-cpu.txt 2> /dev/null || true; \
+	$(BIN)/python -m pip install --disable-pip-version-check --require-hashes --no-deps -r requirements.lock; \
+	if $(BIN)/python -c 'import importlib.metadata as m, sys; sys.exit(sys.platform != "linux" or "+" in m.version("torch"))'; then \
+	  $(BIN)/python -m pip install --disable-pip-version-check --require-hashes --no-deps -r requirements-cuda.lock; \
+	fi; \
 	$(BIN)/python -m pip install --disable-pip-version-check --quiet --no-deps -e .; \
 	cat requirements.lock pyproject.toml > $(VENV)/.installed; \
 	echo "== $(VENV) is ready"
 
-# Resolves pyproject.toml anew in a scratch environment; torch stays at the version pinned below.
+# Resolves pyproject.toml anew for all platforms, with the hashes of all files of a release; torch stays at the version
+# pinned below. What PyPI's torch for Linux needs besides, for a GPU, is in a lock of its own: a CPU build does without.
 lock: TORCH := 2.13.0
-lock:  ## renew requirements.lock
+lock: CPU_WHEELS ?= $(wildcard /opt/wheels/torch-$(TORCH)+cpu-*.whl)
+lock:  ## renew requirements.lock and requirements-cuda.lock
 	@set -e; scratch=$$(mktemp -d); trap 'rm -rf "$$scratch"' EXIT; \
-	python3.11 -m venv $$scratch; \
-	$$scratch/bin/pip install --quiet torch==$(TORCH) ".[viewer,export,dev]"; \
-	{ grep '^#' requirements.lock; \
-	  $$scratch/bin/pip freeze --all --exclude pip --exclude pace-table-tennis | sed 's/+cpu$$//'; } > $$scratch/requirements.lock; \
-	mv $$scratch/requirements.lock requirements.lock; \
-	wc -l requirements.lock
+	python3 -m venv $$scratch; $$scratch/bin/pip install --quiet uv; \
+	echo "torch==$(TORCH)" > $$scratch/pins; \
+	$$scratch/bin/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate \
+	  --all-extras --constraint $$scratch/pins $(LOCK_ARGS) pyproject.toml > $$scratch/all; \
+	for wheel in $(CPU_WHEELS); do \
+	  hash=$$(sha256sum "$$wheel" | cut -d ' ' -f 1); \
+	  sed -i "s|^torch==.*|&\n    --hash=sha256:$$hash \\\\|" $$scratch/all; \
+	done; \
+	for lock in requirements.lock requirements-cuda.lock; do grep '^#' $$lock > $$scratch/$$lock; done; \
+	awk -v folder=$$scratch '/^[^ ]/ { cuda = /^(nvidia-|cuda-|triton)/ } \
+	  { print >> (folder (cuda ? "/requirements-cuda.lock" : "/requirements.lock")) }' $$scratch/all; \
+	mv $$scratch/requirements.lock $$scratch/requirements-cuda.lock .; \
+	grep -c '==' requirements.lock requirements-cuda.lock
 
 clean:  ## remove .venv, caches and build outputs; runs/ stays
 	rm -rf $(VENV) build dist .pytest_cache .ruff_cache

@@ -80,13 +80,35 @@ class Controller:
         """Joint targets (J,) rad, in the order of ``meta["joint_names"]``.
 
         Args: readings: the sensed inputs by name (``meta["inputs"]`` describes them), each of its own size.
+
+        Errors: ``ValueError``, in one line, for a reading that is missing, unknown, of another size or not finite, and
+        for targets that are not finite. The state then stays that of the call before, so that the next one goes on.
         """
-        frame = {name: np.asarray(value, dtype=np.float32)[None] for name, value in readings.items()}
-        frame["state"] = self._state
-        values = self._session.run(self._names, frame)
-        self.outputs = {name: np.asarray(value)[0] for name, value in zip(self._names, values, strict=True)}
-        self._state = self.outputs["state_next"][None]
-        return self.outputs["joint_target"]
+        sizes = {name: port["size"] for name, port in self.meta["inputs"].items() if name != "state"}
+        for name in sorted(sizes.keys() ^ readings.keys(), key=str):
+            raise ValueError(f"the reading {name} is {'missing' if name in sizes else 'no input of the file'}")
+        frame = {name: _reading(name, readings[name], size)[None] for name, size in sizes.items()}
+        values = self._session.run(self._names, frame | {"state": self._state})
+        outputs = {name: np.asarray(value)[0] for name, value in zip(self._names, values, strict=True)}
+        if not all(np.isfinite(value).all() for value in outputs.values()):
+            raise ValueError("the readings are beyond all sense: what follows from them is not finite")
+        self.outputs = outputs
+        self._state = outputs["state_next"][None]
+        return outputs["joint_target"]
+
+
+def _reading(name: str, value: object, size: int) -> Vector:
+    """``value`` as a float32 vector of ``size`` finite numbers. Errors: ``ValueError``."""
+    try:
+        with np.errstate(over="ignore"):  # becomes infinite, which is refused below
+            vector = np.asarray(value).astype(np.float32, casting="same_kind")
+    except (TypeError, ValueError):  # text, numbers of another kind, lists of different lengths
+        vector = np.empty(0, dtype=np.float32)
+    if vector.shape != (size,):
+        raise ValueError(f"the reading {name} must be a vector of {size} numbers")
+    if not np.isfinite(vector).all():
+        raise ValueError(f"the reading {name} is not finite")
+    return vector
 
 
 class Blade(NamedTuple):
@@ -527,7 +549,11 @@ def main() -> int:
     ball = controller.meta["config"]["ball"]
     print(f"policy {controller.meta['source']}, serves {options.serve}, ball {ball['name']}", flush=True)
     started = time.process_time()
-    match.play(options.serves)
+    try:
+        match.play(options.serves)
+    except ValueError as error:  # of the controller
+        print(f"error: {options.policy} cannot be played: {error}", file=sys.stderr)
+        return 1
     print(report(match, time.process_time() - started))
     return 0
 

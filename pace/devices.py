@@ -13,8 +13,8 @@ import torch
 
 from pace.config.automatic import Machine, most_worlds
 from pace.config.base import ConfigError
+from pace.memory import GIB, available_memory
 
-GIB = 2**30
 VISIBLE = "CUDA_VISIBLE_DEVICES"  # NVIDIA's: which GPUs a process may see
 TORCH_INDEX = "pip install torch --index-url https://download.pytorch.org/whl/cu130"
 #: Files that NVIDIA's kernel driver makes (the last one under WSL).
@@ -211,4 +211,4 @@ def machine_of(device: torch.device, count: int = 1) -> Machine:
     if device.type == "cuda":
         memory = torch.cuda.get_device_properties(device).total_memory / GIB
         return Machine("cuda", memory, has_bf16(device), count)
-    return Machine("cpu", bf16=has_bf16(device))
+    return Machine("cpu", available_memory(), has_bf16(device))

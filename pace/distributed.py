@@ -22,7 +22,9 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
+from pace.config.automatic import SHARE_OF_MEMORY, memory_needed
 from pace.cores import threads_of, usable_cores
+from pace.memory import available_memory
 
 T = TypeVar("T")
 
@@ -114,18 +116,21 @@ class ProcessGroup:
 
 
 def suitable_size(num_worlds: int, device: torch.device) -> int:
-    """Processes to share ``num_worlds`` on this machine: one a core, with at least 256 worlds each; one for a GPU."""
+    """Processes to share ``num_worlds`` on this machine: one a core, with at least 256 worlds each, that fit into its
+    memory; one for a GPU."""
     if device.type != "cpu":
         return 1
     most = min(usable_cores(), num_worlds // WORLDS_PER_PROCESS)
-    return max((size for size in range(1, most + 1) if num_worlds % size == 0), default=1)
+    memory = SHARE_OF_MEMORY * available_memory()
+    sizes = (size for size in range(1, most + 1) if memory_needed(num_worlds, size) <= memory)
+    return max((size for size in sizes if num_worlds % size == 0), default=1)
 
 
 @contextmanager
-def process_group(size: int, device: torch.device, arguments: Sequence[str] | None = None) -> Iterator[ProcessGroup]:
+def process_group(size: int, device: torch.device, command: Sequence[str] | None = None) -> Iterator[ProcessGroup]:
     """The process group while the block runs: the one that this process was started in, or a new one of ``size``.
 
-    A new group runs the same command in ``size - 1`` worker processes, with the same or other ``arguments``, each on
+    A new group runs the same command, or ``command`` (arguments of Python), in ``size - 1`` worker processes, each on
     its share of the cores. Errors: :class:`ProcessGroupError` when one of them fails, or if ``size`` > 1 on a GPU.
     """
     membership = os.environ.get(MEMBERSHIP)
@@ -149,7 +154,7 @@ def process_group(size: int, device: torch.device, arguments: Sequence[str] | No
         threads = threads_of(size)
         torch.set_num_threads(threads)
         store = dist.TCPStore(LOCAL_ADDRESS, 0, is_master=True, wait_for_workers=False)
-        with _Workers(size, store.port, threads, sys.argv[1:] if arguments is None else arguments) as workers:
+        with _Workers(size, store.port, threads, command or this_command()) as workers:
             workers.wait_for(store)
             with _connected(device, store=store, rank=0, world_size=size), workers.explaining():
                 yield ProcessGroup(0, size)
@@ -192,7 +197,7 @@ def _connected(device: torch.device, **place: Any) -> Iterator[None]:
 class _Workers:
     """The other ranks, started by rank 0. They end with the block; their output goes to a file."""
 
-    def __init__(self, size: int, port: int, threads: int, arguments: Sequence[str]) -> None:
+    def __init__(self, size: int, port: int, threads: int, command: Sequence[str]) -> None:
         self._open = ExitStack()
         self._logs: dict[int, IO[str]] = {}
         self._started: dict[int, subprocess.Popen[str]] = {}
@@ -201,7 +206,7 @@ class _Workers:
             log = self._open.enter_context(unnamed)
             self._logs[rank] = log
             environment = {MEMBERSHIP: f"{rank} {size} {port}", "OMP_NUM_THREADS": str(threads)}
-            self._started[rank] = _start(arguments, log, environment)
+            self._started[rank] = _start(command, log, environment)
 
     def __enter__(self) -> _Workers:
         return self
@@ -261,12 +266,16 @@ def _end_with_rank_0() -> None:
     os._exit(RANK_0_IS_GONE)
 
 
-def _start(arguments: Sequence[str], log: IO[str], environment: dict[str, str]) -> subprocess.Popen[str]:
-    """Start this command again in its own process group: Ctrl-C then reaches only rank 0, which ends the run."""
+def this_command() -> list[str]:
+    """The command that this process runs, as arguments of Python."""
     module = sys.modules["__main__"].__spec__
-    program = ["-m", module.name] if module else [sys.argv[0]]
+    return [*(["-m", module.name] if module else [sys.argv[0]]), *sys.argv[1:]]
+
+
+def _start(command: Sequence[str], log: IO[str], environment: dict[str, str]) -> subprocess.Popen[str]:
+    """Start Python with ``command`` in its own process group: Ctrl-C then reaches only rank 0, which ends the run."""
     return subprocess.Popen(
-        [sys.executable, *program, *arguments],
+        [sys.executable, *command],
         env=os.environ | environment,
         stdin=subprocess.PIPE,
         stdout=log,

@@ -73,25 +73,35 @@ def test_a_queue_shares_as_many_cores_as_are_granted(monkeypatch: pytest.MonkeyP
     assert sorted(first + second) == [0, 1, 6, 7]
 
 
-GROUPS = Path("/sys/fs/cgroup/cpu")
+GROUPS = Path("/sys/fs/cgroup")
+
+
+def enter(group: Path, **values: str) -> Path:
+    """Make a control group of this machine."""
+    try:
+        group.mkdir()
+        for name, value in values.items():
+            (group / name.replace("_", ".", 1)).write_text(value)
+    except OSError:
+        pytest.skip("this machine lets no test make control groups")
+    return group
 
 
 @pytest.fixture
-def one_core() -> Iterator[Path]:
-    """A control group of this machine with the time of one core."""
-    group = GROUPS / f"pace_test_{os.getpid()}"
-    try:
-        group.mkdir()
-        (group / "cpu.cfs_period_us").write_text("100000")
-        (group / "cpu.cfs_quota_us").write_text("100000")
-    except OSError:
-        pytest.skip("this machine lets no test make control groups")
+def one_core(request: pytest.FixtureRequest) -> Iterator[Path]:
+    """A control group of this machine: with the time of one core, or with one core."""
+    folder = GROUPS / request.param / f"pace_test_{os.getpid()}"
+    if request.param == "cpu":
+        group = enter(folder, cpu_cfs_period_us="100000", cpu_cfs_quota_us="100000")
+    else:
+        group = enter(folder, cpuset_mems="0", cpuset_cpus=str(core_set()[-1]))
     yield group
     group.rmdir()
 
 
 @pytest.mark.skipif(len(core_set()) < 2, reason="needs two cores")
-def test_a_process_in_a_group_with_a_quota_sees_it_before_torch_is_loaded(one_core: Path) -> None:
+@pytest.mark.parametrize("one_core", ["cpu", "cpuset"], indirect=True)
+def test_a_process_in_a_group_with_one_core_sees_it_before_torch_is_loaded(one_core: Path) -> None:
     code = (
         "import sys; from pace.command.run import _limit_threads; _limit_threads(); assert 'torch' not in sys.modules;"
         "import torch; from pace.distributed import suitable_size; from pace.cores import usable_cores;"

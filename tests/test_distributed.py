@@ -216,6 +216,42 @@ def test_a_fault_of_one_process_ends_all() -> None:
     assert all("policy column 1 of world 3 at step 3" in text for text in together(fault))
 
 
+def spoil_rollout(trainer: Trainer) -> None:
+    trainer.env.poison_step = 3  # type: ignore[attr-defined]
+
+
+def spoil_gradient(trainer: Trainer) -> None:
+    weight = next(trainer.agent.parameters())
+
+    def spoilt(gradient: Tensor) -> Tensor:
+        hook.remove()
+        return gradient * torch.nan
+
+    hook = weight.register_hook(spoilt)
+
+
+@pytest.mark.parametrize("spoil", [spoil_rollout, spoil_gradient])
+def test_an_update_that_one_process_spoils_is_skipped_by_all(spoil: Callable[[Trainer], None]) -> None:
+    def train(group: ProcessGroup) -> tuple[list[float], dict[str, Tensor], dict[str, Tensor], dict[str, Tensor]]:
+        trainer, skipped, states = trainer_of(group), [], []
+        for number in range(3):
+            if number == 1 and group.rank == 1:
+                spoil(trainer)
+            skipped.append(trainer._safe_update()["skipped"])
+            states.append({name: tensor.clone() for name, tensor in trainer.agent.state_dict().items()})
+            trainer.env.reset_worlds(torch.ones(trainer.num_worlds, dtype=torch.bool))  # this task has no such guard
+        assert trainer.updates == 3
+        return skipped, *states
+
+    first, second = together(train)
+    for skipped, before, after, then in (first, second):
+        assert skipped == [0.0, 1.0, 0.0]
+        assert all(torch.equal(before[name], after[name]) for name in before)
+        assert any(not torch.equal(after[name], then[name]) for name in after)
+        assert all(bool(tensor.isfinite().all()) for tensor in then.values())
+    assert all(torch.equal(first[3][name], second[3][name]) for name in first[3])
+
+
 def test_size_suits_the_machine(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pace.distributed.usable_cores", lambda: 6)
     assert suitable_size(8, CPU) == 1

@@ -76,6 +76,27 @@ def test_neither_compiler_nor_git(tmp_path: Path) -> None:
     require_trained(pace(tmp_path, "train", *SMALL, "out=run", PATH="/nonexistent"), tmp_path / "run")
 
 
+#: Runs what follows where no library of OpenGL can be loaded.
+WITHOUT_GL = (
+    "unshare", "--mount", "sh", "-c",
+    "for file in $(ldconfig -p | sed -n 's/.*=> //p' | grep -E '/lib(EGL|GL|GLES|OSMesa|OpenGL)[^/]*$'); do "
+    'mount --bind /dev/null "$(readlink -f "$file")" || exit 99; done; exec "$@"', "sh",
+)  # fmt: skip
+
+
+def test_no_opengl(tmp_path: Path) -> None:
+    if os.getuid() != 0 or pace(tmp_path, "--help", before=WITHOUT_GL).returncode != 0:
+        pytest.skip("this machine lets no test hide a library")
+    require_trained(pace(tmp_path, "train", *SMALL, "out=run", before=WITHOUT_GL), tmp_path / "run")
+    done = pace(tmp_path, "evaluate", "run", *EVALUATED, "out=table", before=WITHOUT_GL)
+    assert done.returncode == 0, done.stderr
+    done = pace(tmp_path, "play", "run", "--video", "film.mp4", "seconds=0.1", before=WITHOUT_GL)
+    assert done.returncode == 1
+    assert "apt install libegl1" in done.stderr.strip().splitlines()[-1]
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "film.mp4").exists()
+
+
 @pytest.mark.parametrize("processes", [1, 2])
 def test_a_temporary_folder_that_is_full(tmp_path: Path, processes: int) -> None:
     """A group's workers write there what they print; without that a run needs none."""

@@ -18,7 +18,9 @@ ROOT = Path(pace.__file__).parent
 #: From the ground up, rooms that stand side by side in one line. A file imports from its own room and the lines above.
 ORDER = (
     ("config",),
-    ("moved", "lazy", "cores", "devices"),
+    ("moved", "lazy", "cgroups"),
+    ("cores", "memory"),
+    ("devices",),
     ("arrays", "distributed", "command"),
     ("runs",),
     ("sim.robot_spec",),  # what is known of a robot without simulating it

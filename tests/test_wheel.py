@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -63,7 +64,9 @@ def test_it_carries_the_package_its_configs_and_its_models_and_nothing_else(whee
     models = {str(path.relative_to(ROOT)) for path in (ROOT / "pace" / "sim" / "assets").glob("*.xml")}
     assert {"pace/sim/assets/scene.xml", "pace/sim/assets/t1_paddle.xml"} <= models
     assert "pace/configs/train.yaml" in configs
-    assert names == configs | sources | models
+    policy = {f"pace/pretrained/campaign/{name}" for name in ("checkpoint.json", "weights.safetensors")}
+    assert names == configs | sources | models | policy
+    assert sum(part.compress_size for part in ZipFile(wheel).infolist()) < 5e6
 
 
 def test_its_command_is_pace(wheel: Path) -> None:
@@ -89,4 +92,8 @@ def test_it_trains_and_evaluates_in_an_empty_folder(installed: Path, empty: Path
     table = ("rows=[mixed]", "serves=2", "num_worlds=2", "warmup_serves=0", "physics_dt=0.01", "progress=false")
     run(installed / "pace", "evaluate", "run", "out=table", "engine.threads=1", "first_ball=[]", *table, folder=empty)
     assert (empty / "table" / "evaluation.json").is_file()
-    assert {path.name for path in empty.iterdir()} == {"run", "table"}
+    run(
+        installed / "pace", "evaluate", "campaign", "out=own", "engine.threads=1", "first_ball=[]", *table, folder=empty
+    )
+    assert json.loads((empty / "own" / "evaluation.json").read_text())["rows"][0]["hit"] == 1.0
+    assert {path.name for path in empty.iterdir()} == {"run", "table", "own"}

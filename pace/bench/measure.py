@@ -28,7 +28,7 @@ def bench_from_config(composed: DictConfig) -> None:
     machine = machine_of(resolve_device(str(composed.device)))
     config = parse(choose(composed, machine)[0], BenchConfig)
     overrides = [o for o in HydraConfig.get().overrides.task if not o.lstrip("+~").startswith("bench")]
-    path = make_out(config.out, config.name) / report.FILE
+    path = make_out(config.out, config.name, [report.FILE]) / report.FILE
     measure(config, overrides, path)
     print(f"wrote {path}")
 

@@ -75,7 +75,7 @@ def key_table(keys: Iterable[Key]) -> str:
 
 def group_table(name: str, command: Command) -> str:
     """The groups of a command and their choices."""
-    preset = "saved with the policy" if command.collected and command.positional else ""
+    preset = "saved with the policy" if command.collected and (command.positional or command.rest) else ""
     defaults = default_choices(command)
     lines = []
     for group in command.groups:

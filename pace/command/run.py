@@ -37,6 +37,14 @@ class Terminated(KeyboardInterrupt):
     """A command that a signal has ended (SIGTERM of a preempted job, a lost terminal), after it has saved its work."""
 
 
+class JobFailed(RuntimeError):
+    """A job of a sweep has failed in another process, where a launcher of Hydra ran it, and has told why there."""
+
+    def __init__(self, status: int) -> None:
+        super().__init__(status)  # which is what another process gets of it
+        self.status = status
+
+
 def run_command(name: str) -> int:
     """Run the command ``name`` of :data:`COMMANDS` with ``sys.argv``; returns the exit status.
 
@@ -63,6 +71,8 @@ def _run(name: str) -> int:
         return _run_hydra(COMMANDS[name])
     except (HydraException, OmegaConfBaseException) as error:
         return complain(explain(name, sys.argv[1:], error), EXIT_USAGE)
+    except JobFailed as error:
+        return error.status
     except Terminated:
         return EXIT_TERMINATED
     except KeyboardInterrupt:
@@ -91,37 +101,18 @@ def _topic(arguments: Sequence[str]) -> str:
 
 
 def _run_hydra(command: Command) -> int:
-    """Compose the command's configuration with ``sys.argv`` and do the work; returns the exit status."""
+    """Compose the command's configuration with ``sys.argv`` and do the work; returns the exit status.
+
+    A sweep (``-m``) does all of its jobs, and ends with the status of one that has failed.
+    """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises its errors instead of printing and exiting
-    status = 0
+    status, here = 0, os.getpid()
 
     def guarded(config: DictConfig) -> None:
         nonlocal status  # an error that reached Hydra would be printed a second time
-        try:
-            work, *failures = (resolve_name(path) for path in (command.work, *command.failures))
-        except ModuleNotFoundError as error:
-            if not command.extra or (error.name or "").startswith("pace"):
-                raise
-            status = complain(f"{error}: pip install 'pace-table-tennis[{command.extra}]'", EXIT_FAILED)
-            return
-        except ConfigError as error:
-            status = complain(str(error), EXIT_USAGE)
-            return
-        try:
-            if "plugins" in config:
-                plugins.use_named(config)
-            with also_from(_given_folders()):
-                work(config)
-        except ConfigError as error:
-            status = complain(str(error), EXIT_USAGE)
-        except tuple(failures) as error:
-            status = complain(str(error), EXIT_FAILED)
-        except OSError as error:
-            if error.errno not in DISK:
-                raise
-            status = complain(": ".join(filter(None, (error.filename, error.strerror))), EXIT_FAILED)
-        except RuntimeError as error:
-            status = complain(_full_memory(error), EXIT_FAILED)
+        status = _work(command, config) or status
+        if status and os.getpid() != here:  # of a launcher's job, the returned value and exceptions come back
+            raise JobFailed(status)
 
     hydra.main(config_path=str(config_dir()), config_name=command.config, version_base="1.3")(guarded)()
     return status
@@ -134,6 +125,34 @@ def _full_memory(error: RuntimeError) -> str:
     if not out_of_memory(error):
         raise error
     return full_memory_in_words()
+
+
+def _work(command: Command, config: DictConfig) -> int:
+    """Import the command's function, call it, and print its expected errors; returns the exit status."""
+    try:
+        work, *failures = (resolve_name(path) for path in (command.work, *command.failures))
+    except ModuleNotFoundError as error:
+        if not command.extra or (error.name or "").startswith("pace"):
+            raise
+        return complain(f"{error}: pip install 'pace-table-tennis[{command.extra}]'", EXIT_FAILED)
+    except ConfigError as error:
+        return complain(str(error), EXIT_USAGE)
+    try:
+        if "plugins" in config:
+            plugins.use_named(config)
+        with also_from(_given_folders()):
+            work(config)
+    except ConfigError as error:
+        return complain(str(error), EXIT_USAGE)
+    except tuple(failures) as error:
+        return complain(str(error), EXIT_FAILED)
+    except OSError as error:
+        if error.errno not in DISK:
+            raise
+        return complain(": ".join(filter(None, (error.filename, error.strerror))), EXIT_FAILED)
+    except RuntimeError as error:
+        return complain(_full_memory(error), EXIT_FAILED)
+    return 0
 
 
 def _given_folders() -> list[Path]:

@@ -13,8 +13,9 @@ TRAIN_GROUPS = (
 )  # fmt: skip
 CHECKPOINT_ERROR = "pace.runs.checkpoint:CheckpointError"
 SAVED_RUN = (
-    "RUN is a run folder, a checkpoint in one, or pretrained/<name>. The task is the one saved with the "
-    "policy; change it as in training, by a choice of a group (ball=paper) or a value (engine.solver_iterations=20)."
+    "RUN is a run folder, a checkpoint in one, or the name of a published policy (campaign). The task is the one saved "
+    "with the policy; change it as in training, by a choice of a group (ball=paper) or a value "
+    "(engine.solver_iterations=20)."
 )
 
 
@@ -93,7 +94,7 @@ COMMANDS = {
         extra="viewer",
         config="play",
         summary="a policy on a live page in the browser, or in a video (--video FILE)",
-        usage="RUN [--video FILE.mp4] [key=value ...]",
+        usage="[RUN] [--video FILE.mp4] [key=value ...]",
         about=SAVED_RUN + " A file of a run's replays/ shows what went wrong in its training.",
         examples=(
             "pretrained/pace",
@@ -114,7 +115,8 @@ COMMANDS = {
         config="export",
         summary="a policy as one ONNX file for the robot, checked against torch",
         usage="RUN [key=value ...]",
-        about="RUN is a run folder, a checkpoint in one, or pretrained/<name>. Writes policy.onnx into the folder out.",
+        about="RUN is a run folder, a checkpoint in one, or the name of a published policy (campaign). Writes "
+        "policy.onnx into the folder out.",
         examples=("pretrained/pace", "runs/2026-01-01_pace out=runs/robot"),
         positional=("run",),
     ),
@@ -143,6 +145,27 @@ COMMANDS = {
         ),
         collected=True,
         refused={"experiment": "experiments= names them", "seed": "seeds= lists them", "minutes": "samples= ends runs"},
+    ),
+    "compare": Command(
+        module="pace.studies.compare",
+        work="pace.studies.comparison:compare_from_config",
+        failures=("pace.evaluation.serves:EvaluationError", CHECKPOINT_ERROR),
+        config="compare",
+        summary="learning curves of runs, seeds as bands, and two policies on the same serves",
+        usage="RUN [RUN ...] [key=value ...]",
+        about="RUN is a run folder, a checkpoint, pretrained/<name>, or a CSV that pace ablate wrote. Runs whose "
+        "configurations differ in the seed alone are one curve with a band. Exactly two policies also play the same "
+        "serves, for paired intervals, on one task (task=table) that is changed as in training.",
+        examples=(
+            "runs/a_seed1 runs/a_seed2 runs/b_seed1 runs/b_seed2",
+            "pretrained/pace pretrained/campaign serves=5000 rows=[short,mixed] ball=paper",
+            "runs/a runs/b play=false out=runs/comparison",
+        ),
+        rest="runs",
+        groups=(*TASK_GROUPS, "engine"),
+        training_keys=TASK_VALUES,
+        collected=True,
+        refused={"serve": "rows= names the serve ranges, such as rows=[short]"},
     ),
     "keep": Command(
         module="pace.evaluation.keep",
@@ -218,7 +241,8 @@ COMMANDS = {
         summary="measurements of engines, step sizes, motors, predictors, ... (extra dev)",
         usage="STUDY [STUDY ...] [key=value ...]",
         about="Prints the tables of the documentation and draws their figures. STUDY: reaction, parity, steps, solver, "
-        "motors, predictor, adaptation, senses, rounding, recipe, learning, architecture, or all.",
+        "motors, robots, ankles, predictor, adaptation, senses, rounding, serves, recipe, learning, memory, soak, "
+        "page, architecture, or all.",
         examples=("parity worlds=16", "steps solver run=pretrained/pace", "predictor serves=512 cases=[rubber]"),
         rest="studies",
     ),

@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
 
-from pace.config.base import config_dir, parse
+from pace.config.base import ConfigError, config_dir, parse
 
 AUTO = "auto"
-SHARE_OF_MEMORY = 0.8  # of a GPU that a run may fill; the rest is for its driver, and for what else runs there
+SHARE_OF_MEMORY = 0.8  # that a run may fill; the rest is for what else runs there, and for a GPU's driver
 #: Keys that may be ``auto``, and how their values are said.
 KEYS = {
     "num_worlds": "{} worlds",
@@ -30,7 +30,7 @@ class DeviceValues:
     minibatches: int
     samples: float  # control steps of a run, if neither its samples nor its minutes are given
     minutes: float
-    memory: float  # GiB, of a run without worlds
+    memory: float  # GiB, of each process of a run without worlds
     memory_per_world: float  # GiB
 
 
@@ -51,7 +51,7 @@ def choose(composed: DictConfig, machine: Machine) -> tuple[DictConfig, dict[str
     """The configuration with values in place of ``auto``, and those that were chosen, by key."""
     found = OmegaConf.create(OmegaConf.to_container(composed))
     assert isinstance(found, DictConfig)
-    given = _given(machine)
+    given = device_values(machine.kind)
     values = _values(given, machine)
     chosen = {key: values[key] for key in KEYS if key in values and OmegaConf.select(found, key) == AUTO}
     for key, value in chosen.items():
@@ -70,9 +70,28 @@ def left_open(composed: DictConfig) -> set[str]:
     return {key for key in KEYS if OmegaConf.select(composed, key) == AUTO}
 
 
-def _given(machine: Machine) -> DeviceValues:
+def device_values(kind: str) -> DeviceValues:
+    """The values of one ``kind`` of device, cpu or cuda."""
     table = OmegaConf.load(config_dir() / "algo" / "_auto.yaml")
-    return parse(OmegaConf.select(table, machine.kind), DeviceValues)
+    return parse(OmegaConf.select(table, kind), DeviceValues)
+
+
+def memory_needed(num_worlds: int, processes: int) -> float:
+    """GiB that a run on a CPU takes at least."""
+    given = device_values("cpu")
+    return processes * given.memory + num_worlds * given.memory_per_world
+
+
+def require_memory(num_worlds: int, processes: int, memory: float) -> None:
+    """Errors: :class:`ConfigError` if a run on a CPU needs more than ``memory`` (GiB); it says what fits."""
+    needed, given = memory_needed(num_worlds, processes), device_values("cpu")
+    if needed <= memory:
+        return
+    room = max(0.0, SHARE_OF_MEMORY * memory - processes * given.memory)
+    fitting = processes * int(room / given.memory_per_world / processes)
+    cure = f"num_worlds={fitting} fits" if fitting else "give fewer processes=" if processes > 1 else "free some"
+    what = f"{num_worlds} worlds in {processes} processes" if processes > 1 else f"{num_worlds} worlds"
+    raise ConfigError(f"{what} need about {needed:.1f} GiB of memory, and {memory:.1f} are left: {cure}")
 
 
 def _choose_the_end(config: DictConfig, given: DeviceValues) -> None:
@@ -94,7 +113,7 @@ def _values(given: DeviceValues, machine: Machine) -> dict[str, Any]:
 
 def most_worlds(memory: float) -> int:
     """Estimate of the worlds of a training run that fit into a GPU's ``memory`` (GiB), a multiple of 256."""
-    given = _given(Machine("cuda"))
+    given = device_values("cuda")
     return max(int((SHARE_OF_MEMORY * memory - given.memory) / given.memory_per_world), 0) // 256 * 256
 
 

@@ -1,4 +1,4 @@
-"""The other commands: bench, evaluate, export, play, ablate, keep, validate, studies."""
+"""The other commands: bench, evaluate, export, play, ablate, compare, keep, validate, studies."""
 
 from __future__ import annotations
 
@@ -202,6 +202,43 @@ class AblateConfig:
 
 
 @dataclass
+class CompareConfig:
+    """``python -m pace.studies.compare``: the runs, and the serves that two policies play."""
+
+    runs: list[str]
+    figure: str  # its name in out
+    window: float  # control steps that a point of a curve averages over
+    play: bool
+    task: str  # table, own
+    rows: list[str]  # names of configs/serve/
+    serves: int  # least number of serves per row
+    warmup_serves: int  # first serves of each world, not counted
+    balls_per_world: int  # counted
+    num_worlds: int | None  # None: as many as balls_per_world asks for
+    device: str
+    seed: int
+    physics_dt: float  # s
+    overrides: list[str]  # of the task
+    out: str | None
+    progress: bool
+    plugins: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        require(len(self.runs) > 0, "which runs? give run folders, checkpoints, pretrained/<name> or CSVs")
+        for run in self.runs:
+            require(self.runs.count(run) == 1, f"{run} is given twice")
+        require(self.figure.endswith(".png"), f"figure must end in .png, got {self.figure}")
+        require(len(self.rows) > 0, "rows must name at least one serve range; play=false plays none")
+        require(self.task in ("table", "own"), f"task must be table or own, not {self.task!r}")
+
+    @property
+    def worlds(self) -> int:
+        """Worlds that play a row."""
+        worlds = math.ceil(self.serves / self.balls_per_world) if self.num_worlds is None else self.num_worlds
+        return min(worlds, self.serves)
+
+
+@dataclass
 class KeepConfig:
     """``python -m pace.evaluation.keep``: the run to publish, and the folder."""
 
@@ -229,6 +266,7 @@ class StudiesConfig:
     studies: list[str]  # names, or all
     worlds: int
     serves: int
+    hours: float  # of play
     run: str | None
     cases: list[str]
     predictors: list[str]

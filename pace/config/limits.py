@@ -183,7 +183,11 @@ LIMITS: dict[str, dict[str, Limits]] = {
         "width": (2, 16_384), "height": (2, 16_384), "fps": (1, 1000),
     },
     "AblateConfig": {"seeds": SEED, "samples": (1.0, 1e15), "jobs": (1, 4096), "window": (TINY, 1e15)},
-    "StudiesConfig": {"worlds": (1, 2**24), "serves": COUNT},
+    "CompareConfig": {
+        "window": (TINY, 1e15), "serves": COUNT, "warmup_serves": (0, 10**6), "balls_per_world": COUNT,
+        "num_worlds": (1, 2**24), "seed": SEED, "physics_dt": STEP,
+    },
+    "StudiesConfig": {"worlds": (1, 2**24), "serves": COUNT, "hours": (TINY, 1000.0)},
 }  # fmt: skip
 
 

@@ -62,7 +62,7 @@ def export_from_config(composed: DictConfig) -> None:
     policy = load_policy(config.run)
     if config.out and Path(config.out).suffix == ".onnx":
         raise ExportError(f"out={config.out} must be a folder, in which policy.onnx is written")
-    out = make_out(config.out, "export") / FILE
+    out = make_out(config.out, "export", [FILE]) / FILE
     differences = export_policy(policy, out, config)
     count = config.check_worlds * config.check_steps
     units = {name: port.unit for name, port in output_ports(policy.config).items()}

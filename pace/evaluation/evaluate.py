@@ -4,25 +4,26 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig
-from tqdm import tqdm
 
 from pace.config.base import parse, to_dict
 from pace.config.commands import EvaluateConfig
 from pace.config.overrides import override_task
 from pace.config.training import TrainConfig
 from pace.devices import resolve_device
-from pace.evaluation.figures import write_figures
+from pace.evaluation.bar import serve_bar
+from pace.evaluation.figures import FIGURES, write_figures
 from pace.evaluation.first_ball import first_ball_row
 from pace.evaluation.quality import QualityRecorder
+from pace.evaluation.report import FILES as REPORT
 from pace.evaluation.report import describe, tables, write_report
-from pace.evaluation.serves import MakeRecorder, OnCount, Row, evaluate_row
+from pace.evaluation.serves import MakeRecorder, Row, evaluate_row
+from pace.evaluation.sweep import FILES as SWEEP
 from pace.evaluation.sweep import (
     Cell,
     Tables,
@@ -36,7 +37,7 @@ from pace.evaluation.sweep import (
 )
 from pace.evaluation.task import own_pauses, policy_on, task_line
 from pace.rl.policies import TaskPolicy, built_in_policy, load_policy
-from pace.runs.progress import SECONDS_PER_LINE, clock
+from pace.runs.progress import clock
 from pace.runs.run_folder import make_out, versions
 
 TASK_PARTS = ("robot", "ball", "engine", "randomization", "sensing")  # parts of the task in the report
@@ -54,13 +55,18 @@ def evaluate_from_config(composed: DictConfig) -> None:
     told = task_line(config.task, saved.config, task)
     print(f"policy {policy.source}\n{told}\n{describe(context)}", flush=True)
     cells = plan(config, policy, task, overrides, context["versions"])
-    folder = make_out(config.out, "evaluation")
+    folder = make_out(config.out, "evaluation", files_of(config))
     finished = finished_cells(folder, cells) if cells else {}
     if config.rows:
         first = evaluate_table(config, policy, task, overrides, folder, context)
         finished |= played_first_balls(config, cells, first)
     if cells:
         _announce(run_sweep(config, policy, cells, finished, folder, context))
+
+
+def files_of(config: EvaluateConfig) -> list[str]:
+    """Names of the files that an evaluation writes."""
+    return [*((*REPORT, *FIGURES) if config.rows else ()), *(SWEEP if config.sweep else ())]
 
 
 def plan(
@@ -120,7 +126,7 @@ def _first_ball(
 ) -> dict[str, Any]:
     """The row of one time, with a progress bar of its robots."""
     worlds, kind = config.first_ball_worlds, config.first_ball_kind
-    with _bar(config, f"first ball after {wait:g} s", worlds) as show:
+    with serve_bar(f"first ball after {wait:g} s", worlds, config.progress) as show:
         return first_ball_row(policy, wait, worlds, serve, kind, device, config.seed, overrides, show)
 
 
@@ -224,23 +230,10 @@ def _with_bar(
     record: MakeRecorder | None = None,
 ) -> Row:
     """One row, with a progress bar of its serves."""
-    with _bar(config, label, serves) as show:
+    with serve_bar(label, serves, config.progress) as show:
         return evaluate_row(
             policy, serve, serves, num_worlds, device, config.seed, overrides, config.warmup_serves, show, record
         )
-
-
-@contextmanager
-def _bar(config: EvaluateConfig, label: str, total: int) -> Iterator[OnCount]:
-    """A progress bar of ``total`` serves, as a function of their number."""
-    interval = 0.2 if sys.stderr.isatty() else SECONDS_PER_LINE
-    look = {"desc": f"{label:<10}", "unit": "serve", "disable": not config.progress, "mininterval": interval}
-    with tqdm(total=total, **look) as bar:
-
-        def show(counted: int) -> None:
-            bar.update(min(counted, total) - bar.n)
-
-        yield show
 
 
 def _announce(files: Sequence[Path]) -> None:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.legend import Legend
 
 STRIKES, LANDINGS, FOOTWORK, BALLS = "strike_map.png", "landing_map.png", "footwork.png", "by_ball.png"
+FIGURES = (STRIKES, LANDINGS, FOOTWORK, BALLS)
 #: Serve ranges by speed, m/s, as in the paper's table II: label, fastest and slowest vx, colour.
 SPEED_CLASSES = (
     ("long, 6.2 to 6.5 m/s", -6.5, -6.2, "tab:red"),

@@ -18,6 +18,7 @@ from pace.evaluation.text import interval, markdown_table, number, text_table
 from pace.runs.files import write_whole
 
 JSON, CSV, MARKDOWN, SERVES = "evaluation.json", "evaluation.csv", "evaluation.md", "serves.csv"
+FILES = (JSON, CSV, MARKDOWN, SERVES)
 UNITS = {
     "hit, success": "shares of serves; _low and _high: 95 % Wilson interval",
     "outbound_speed": "m/s, mean over hits",
@@ -156,7 +157,7 @@ def write_report(
     first_ball: Mapping[str, Any] | None = None,
 ) -> list[Path]:
     """JSON, CSV, Markdown and the single serves in ``folder``; returns the files."""
-    files = [folder / name for name in (JSON, CSV, MARKDOWN, SERVES)]
+    files = [folder / name for name in FILES]
     summaries = [row.summary for row in rows]
     seconds = {row.serve: round(row.seconds, 1) for row in rows}
     published = {name: vars(paper[name]) for name in (row.serve for row in rows) if name in paper}

@@ -26,6 +26,7 @@ from pace.evaluation.serves import EvaluationError
 from pace.rl.policies import TaskPolicy
 
 JSON, MAP = "sweep.json", "sweep.png"
+FILES = (JSON, MAP)
 SLOWNESS = 10.0  # times that mjwarp takes on a CPU (docs/results/speed.md), for the time that is left
 Tables = dict[str, list[dict[str, Any]]]  # summaries of a cell's rows, by its key
 #: Kinds of change by what they are called before their value in the heat map; others by their own name.
@@ -210,7 +211,7 @@ def write_sweep(folder: Path, cells: Sequence[Cell], tables: Tables, context: Ma
     """
     done = [cell for cell in cells if cell.key in tables]
     entries = [_entry(cell, tables[cell.key]) for cell in done]
-    files = [folder / JSON, folder / MAP]
+    files = [folder / name for name in FILES]
     folder.mkdir(parents=True, exist_ok=True)
     parts = [file.with_name(f"part_{file.name}") for file in files]
     write_json(parts[0], {"cells": entries, **context})

@@ -131,16 +131,17 @@ def _outside_named(source: str) -> Iterator[None]:
 
 
 def locate(path: str | Path) -> Path:
-    """``path``, or the one of that name beside the package's ``configs/`` (so that ``pretrained/<name>`` is found).
+    """``path``, or the one of that name beside the package's ``configs/`` (so that ``pretrained/<name>`` is found), or
+    the published policy of that name.
 
     Errors: :class:`CheckpointError` for a file that is no part of a checkpoint, and, with the existing names, for a
     missing ``pretrained/<name>``.
     """
-    path = Path(path)
-    if not path.exists() and not path.is_absolute() and (config_dir().parent / path).exists():
-        path = config_dir().parent / path
-    if not path.exists() and path.parent.name == PRETRAINED:
-        known = sorted(file.parent.name for file in (config_dir().parent / PRETRAINED).glob(f"*/{META}"))
+    path, own = Path(path), config_dir().parent
+    if not path.exists() and not path.is_absolute():
+        path = next((found for found in (own / path, own / PRETRAINED / path) if found.exists()), path)
+    if not path.exists() and path.parent.name in (PRETRAINED, ""):
+        known = sorted(file.parent.name for file in (own / PRETRAINED).glob(f"*/{META}"))
         raise CheckpointError(f"{path} does not exist{meant(path.name, known)} ({PRETRAINED}: {', '.join(known)})")
     if path.is_file() and path.name not in (META, WEIGHTS, TRAINING):
         raise CheckpointError(f"{path} is no file of a checkpoint: give a run folder, or a folder with {META}")

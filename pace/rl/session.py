@@ -26,6 +26,7 @@ from pace.config.training import RESUME_KEYS, TrainConfig
 from pace.cores import threads_of
 from pace.devices import has_bf16, machine_of, resolve_device
 from pace.distributed import ProcessGroup, is_first_here, launched_size, own_device, process_group, suitable_size
+from pace.memory import available_memory
 from pace.predictor.network import BallPredictor, make_predictor
 from pace.predictor.priors import resolve_priors
 from pace.rl.curriculum import Curriculum
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
 #: Makes the judge of a run; films its newest policy for so long, s.
 MakeJudge = Callable[[JudgeConfig], Judge]
 Film = Callable[[Path, float], None]
+COMMAND = "pace.rl.train"
 SEEDS_APART = 1_000_003  # between the stages of a curriculum: further than seeds of runs lie apart
 
 
@@ -71,9 +73,12 @@ def train_from_config(composed: DictConfig, make_judge: MakeJudge | None = None,
         chosen = adapt(config, saved, device, overrides)
     config.processes = config.processes or suitable_size(config.num_worlds, device)
     if is_first_here():
+        if device.type == "cpu" and launched_size() == 1:
+            automatic.require_memory(config.num_worlds, config.processes, available_memory())
         warm(config, device)  # before any clock runs, and once for all processes of this machine
-    arguments = overrides if hydra.mode == RunMode.MULTIRUN else None  # of this job; the command's are of all
-    with process_group(config.processes, device, arguments) as group:
+    # a job of a sweep, which a launcher may have started by another program; the command's arguments are of all jobs
+    command = ["-m", COMMAND, *overrides] if hydra.mode == RunMode.MULTIRUN else None
+    with process_group(config.processes, device, command) as group:
         trainer = build_trainer(config, saved, device, group)
         if trainer.run is not None:
             announce(trainer, trainer.run, saved, chosen)

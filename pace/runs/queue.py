@@ -84,13 +84,13 @@ def check_settings(run: Run) -> Run:
     Errors: :class:`ConfigError` that names a key in which they differ, or a wrong key of the request.
     """
     config = load_train_config(list(run.overrides))
-    run, asked = replace(run, plugins=tuple(config.plugins)), _flat(to_dict(config))
+    run, asked = replace(run, plugins=tuple(config.plugins)), flat(to_dict(config))
     open_keys = left_open(compose("train", list(run.overrides)))
     checkpoints = list_checkpoints(run.folder)
     if not checkpoints:
         return run
     saved = read_meta(checkpoints[-1])["config"]
-    there = _flat(to_dict(parse(saved, TrainConfig)))
+    there = flat(to_dict(parse(saved, TrainConfig)))
     for key in sorted(set(asked) | set(there)):
         if key not in open_keys and not _is_free(key, asked) and asked.get(key) != there.get(key):
             what = f"{key} {there.get(key)}, and {asked.get(key)} is asked for"
@@ -104,11 +104,11 @@ def _is_free(key: str, asked: Mapping[str, object]) -> bool:
     return derived or key.split(".")[0] in FREE_KEYS
 
 
-def _flat(tree: dict, prefix: str = "") -> dict:
+def flat(tree: dict, prefix: str = "") -> dict:
     """Leaves of nested dictionaries by their dotted keys."""
     leaves = {}
     for key, value in tree.items():
-        leaves |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+        leaves |= flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
     return leaves
 
 

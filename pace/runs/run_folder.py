@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from itertools import count
@@ -27,6 +27,7 @@ from pace.runs.checkpoint import Checkpoint, CheckpointError, save_checkpoint
 from pace.runs.checkpoint_folders import FOLDER, clear_leftovers, list_checkpoints, prune_checkpoints, update_of
 from pace.runs.files import reason, say, write_whole
 from pace.runs.metrics_file import FIRST_COLUMN, EventsFile, MetricsFile
+from pace.runs.own_files import claim
 
 STAMP = "# format: "  # begins the first line of a run's configuration
 LOCK = ".lock"
@@ -52,10 +53,12 @@ def new_folder(name: str) -> Path:
     raise AssertionError("count() does not end")
 
 
-def make_out(out: str | None, name: str) -> Path:
+def make_out(out: str | None, name: str, files: Sequence[str] = ()) -> Path:
     """The folder that a command writes: ``out``, or a :func:`new_folder`. Made before the work begins.
 
-    Errors: :class:`ConfigError` for one that cannot be made or written.
+    ``files`` are those that it will write there (:func:`pace.runs.own_files.claim`).
+
+    Errors: :class:`ConfigError` for a folder that cannot be made or written, or holds other files of these names.
     """
     folder = Path(out) if out else Path("runs")
     try:
@@ -69,6 +72,8 @@ def make_out(out: str | None, name: str) -> Path:
         tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
         raise ConfigError(f"out={folder} cannot be written: {reason(error)}") from error
+    if files:
+        claim(folder, files)
     return folder
 
 

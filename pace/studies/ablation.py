@@ -38,7 +38,8 @@ def ablate_from_config(composed: DictConfig) -> None:
     Errors: :class:`AblationError`, at the end, if runs failed.
     """
     config = parse(composed, AblateConfig)
-    out = make_out(config.out, "ablation")
+    tables = [f"{run.name}.csv" for run in planned_runs(config)] if config.train else []
+    out = make_out(config.out, "ablation", [config.figure, *tables])
     failures: Mapping[str, str] = {}
     if config.train:
         failures = train(config, out)

@@ -229,10 +229,10 @@ def print_speed(num_worlds: int = 1024) -> None:
 def validate_from_config(composed: DictConfig) -> None:
     """Draw the figures into the configured folder, and print the numbers."""
     config = parse(composed, ValidateConfig)
-    out = make_out(config.out, "validate")
-    save_figure(out / "flight_error.png", (9, 3.4), draw_flight_errors)
-    save_figure(out / "rebound.png", (9, 3.4), draw_rebound)
-    save_figure(out / "presets.png", (7.5, 5.4), draw_presets)
+    figures = {"flight_error.png": draw_flight_errors, "rebound.png": draw_rebound, "presets.png": draw_presets}
+    out = make_out(config.out, "validate", list(figures))
+    for name, draw in figures.items():
+        save_figure(out / name, (7.5, 5.4) if draw is draw_presets else (9, 3.4), draw)
     print_presets()
     print_checks()
     print_speed()

@@ -1,6 +1,7 @@
 """The studies by name: engine parity, step sizes, solver settings, paddle reaction, motors, cost of the robots,
 ankles, predictors and their error bounds, adaptation to the paddle, on-board estimates, bf16 rounding in
-the update, the balls of a machine, the learning curves of the recipes that were tried, and the rooms of the package.
+the update, the balls of a machine, the learning curves of the recipes that were tried, memory and serves of long runs,
+and the rooms of the package.
 
 They print the tables of the pages in ``docs/results`` and draw their figures.
 """
@@ -21,7 +22,9 @@ from pace.studies import (
     ankles,
     architecture,
     learning_curves,
+    memory,
     motors,
+    page_soak,
     parity,
     predictor,
     reaction,
@@ -30,13 +33,30 @@ from pace.studies import (
     rounding,
     senses,
     serves,
+    soak,
     steps,
+    watch,
 )
 from pace.studies.common import save_figure
 from pace.studies.swings import Swings, policy_swings, random_swings
 
 GENERALIST = Path("pretrained/campaign")
 RESULTS = Path("docs/results")
+#: File that a study writes, if it draws anything.
+FIGURES = {
+    "reaction": "paddle_reaction.png",
+    "parity": "engine_parity.png",
+    "steps": "step_size.png",
+    "adaptation": "adaptation.png",
+    "serves": "serve_machine.png",
+    "predictor": "predictor.png",
+    "recipe": "recipe.png",
+    "learning": "learning.png",
+    "memory": "memory.png",
+    "soak": "soak.png",
+    "page": "page_soak.png",
+    "architecture": "architecture.png",
+}
 
 
 @dataclass(frozen=True)
@@ -45,6 +65,7 @@ class Options:
 
     worlds: int
     serves: int
+    hours: float
     run: Path | None
     cases: list[str]
     predictors: list[Path]
@@ -55,7 +76,7 @@ def study_reaction(options: Options) -> None:
     strikes = reaction.strike_all(options.worlds)
     print(reaction.table(strikes))
     print(f"cost: {1e3 * reaction.cost():.2f} ms a control step of 1,024 worlds")
-    save_figure(options.out / "paddle_reaction.png", (9, 3.2), lambda figure: reaction.draw(strikes, figure))
+    save_figure(options.out / FIGURES["reaction"], (9, 3.2), lambda figure: reaction.draw(strikes, figure))
 
 
 def study_parity(options: Options) -> None:
@@ -63,7 +84,7 @@ def study_parity(options: Options) -> None:
     print(parity.table(found))
     print()
     print(parity.strike_table(found))
-    save_figure(options.out / "engine_parity.png", (9.5, 3.2), lambda figure: parity.draw(found, figure))
+    save_figure(options.out / FIGURES["parity"], (9.5, 3.2), lambda figure: parity.draw(found, figure))
 
 
 def _swings(options: Options) -> Swings:
@@ -75,7 +96,7 @@ def _swings(options: Options) -> Swings:
 def study_steps(options: Options) -> None:
     cases = steps.step_cases(_swings(options).windows(steps.LENGTH))
     print(steps.table(cases))
-    save_figure(options.out / "step_size.png", (9.5, 3.2), lambda figure: steps.draw_steps(cases, figure))
+    save_figure(options.out / FIGURES["steps"], (9.5, 3.2), lambda figure: steps.draw_steps(cases, figure))
 
 
 def study_solver(options: Options) -> None:
@@ -99,7 +120,7 @@ def study_ankles(options: Options) -> None:
 def study_adaptation(options: Options) -> None:
     found = adaptation.adaptations(_policies(options), options.worlds)
     print(adaptation.table(found))
-    save_figure(options.out / "adaptation.png", (11.5, 3.2), lambda figure: adaptation.draw(found, figure))
+    save_figure(options.out / FIGURES["adaptation"], (11.5, 3.2), lambda figure: adaptation.draw(found, figure))
 
 
 def study_senses(options: Options) -> None:
@@ -114,7 +135,7 @@ def study_serves(options: Options) -> None:
     found = serves.sample()
     print(f"{found.bad:.1e} of {serves.COUNT:,} balls are bad after all attempts")
     print(serves.table(found))
-    save_figure(options.out / "serve_machine.png", (13, 3.2), lambda figure: serves.draw(found, figure))
+    save_figure(options.out / FIGURES["serves"], (13, 3.2), lambda figure: serves.draw(found, figure))
 
 
 def _policies(options: Options) -> list[Path]:
@@ -130,7 +151,7 @@ def study_predictor(options: Options) -> None:
         found.append(predictor.compare(case, options.serves, options.predictors))
         print(f"{case}: done", flush=True)
     print(predictor.table(found))
-    save_figure(options.out / "predictor.png", (9.5, 3.6), lambda figure: predictor.draw(found, figure))
+    save_figure(options.out / FIGURES["predictor"], (9.5, 3.6), lambda figure: predictor.draw(found, figure))
 
 
 def study_recipe(options: Options) -> None:
@@ -139,13 +160,32 @@ def study_recipe(options: Options) -> None:
         recipe.take_over(runs, options.run)
     curves = {tried: tried.curve() for tried in runs}
     print(recipe.table(curves))
-    print(f"wrote {recipe.draw(curves, options.out / 'recipe.png')}")
+    print(f"wrote {recipe.draw(curves, options.out / FIGURES['recipe'])}")
 
 
 def study_learning(options: Options) -> None:
     curves = learning_curves.read(RESULTS)
     print(learning_curves.table(curves))
-    print(f"wrote {learning_curves.draw(curves, options.out / 'learning.png')}")
+    print(f"wrote {learning_curves.draw(curves, options.out / FIGURES['learning'])}")
+
+
+def study_memory(options: Options) -> None:
+    watched = memory.watch_training(options.out)
+    print(watch.text(watched, "updates"))
+    save_figure(options.out / FIGURES["memory"], (11, 3), lambda figure: watch.draw(watched, "updates", figure))
+
+
+def study_soak(options: Options) -> None:
+    found, watched = soak.soak(load_policy(options.run or GENERALIST), options.serves, options.worlds)
+    print(soak.text(found))
+    print(watch.text(watched, "serves"))
+    save_figure(options.out / FIGURES["soak"], (7.5, 3), lambda figure: watch.draw(watched, "serves", figure))
+
+
+def study_page(options: Options) -> None:
+    watched, sent = page_soak.watch_page(load_policy(options.run or GENERALIST), options.hours)
+    print(f"{watch.text(watched, 's of play')}\n{sent / 2**20:.0f} MiB sent to the browser")
+    save_figure(options.out / FIGURES["page"], (7.5, 3), lambda figure: watch.draw(watched, "s of play", figure))
 
 
 def study_architecture(options: Options) -> None:
@@ -167,6 +207,9 @@ STUDIES = {
     "serves": study_serves,
     "recipe": study_recipe,
     "learning": study_learning,
+    "memory": study_memory,
+    "soak": study_soak,
+    "page": study_page,
     "architecture": study_architecture,
 }
 
@@ -185,10 +228,11 @@ def study_from_config(composed: DictConfig) -> None:
     options = Options(
         worlds=config.worlds,
         serves=config.serves,
+        hours=config.hours,
         run=Path(config.run) if config.run else None,
         cases=config.cases,
         predictors=[Path(path) for path in config.predictors],
-        out=make_out(config.out, "studies"),
+        out=make_out(config.out, "studies", [FIGURES[name] for name in names if name in FIGURES]),
     )
     for name in names:
         print(f"\n== {name}")

@@ -13,7 +13,7 @@ from pace.config.commands import PlayConfig
 from pace.evaluation.sweep import ball_presets
 from pace.rl.policies import TaskPolicy, load_policy
 from pace.runs.progress import SECONDS_PER_LINE
-from pace.runs.run_folder import REPLAY_SUFFIX
+from pace.runs.run_folder import REPLAY_SUFFIX, make_out
 from pace.viewer.playback import Show
 from pace.viewer.replay import ReplayPage, load_show
 from pace.viewer.server import require_viewer
@@ -68,6 +68,7 @@ def film(config: PlayConfig, show: Shown, about: str) -> None:
     """Write the video."""
     assert config.video
     file = Path(config.video)
+    make_out(str(file.parent), "video", [file.name])
     total = round(config.seconds * config.fps / config.speed)
     size = (config.width, config.height)
     interval = 0.2 if sys.stderr.isatty() else SECONDS_PER_LINE

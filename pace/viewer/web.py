@@ -197,13 +197,14 @@ class Page:
             before = time.monotonic()
             while not ended():
                 now = time.monotonic()
-                self._step(min(now - before, LONGEST_FRAME))
+                self.step(min(now - before, LONGEST_FRAME))
                 before = now
                 time.sleep(max(0.0, FRAME - (time.monotonic() - now)))
         finally:
             self.server.stop()
 
-    def _step(self, elapsed: float) -> None:
+    def step(self, elapsed: float) -> None:
+        """Do what the browsers have asked for, and show them ``elapsed`` s more; without a browser, wait a moment."""
         while True:
             try:
                 self._requests.get_nowait()()

@@ -108,6 +108,18 @@ def edit_meta(run: Path, **changes: object) -> None:
     file.write_text(json.dumps({**json.loads(file.read_text()), **changes}))
 
 
+def test_a_published_policy_is_found_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert load_policy("campaign").source == load_policy("pretrained/campaign").source
+    (tmp_path / "campaign").mkdir()  # what lies here comes first
+    with pytest.raises(CheckpointError, match="campaign is neither a run folder nor a checkpoint"):
+        load_policy("campaign")
+    with pytest.raises(
+        CheckpointError, match=r"campagne does not exist; did you mean campaign\? \(pretrained: campaign,"
+    ):
+        load_policy("campagne")
+
+
 def test_no_run(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="does not exist"):
         load_policy(tmp_path / "nowhere")

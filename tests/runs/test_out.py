@@ -10,11 +10,16 @@ import pytest
 
 from pace.bench.__main__ import main as bench
 from pace.config.base import ConfigError
+from pace.deploy.__main__ import main as export
 from pace.evaluation.__main__ import main as evaluate
 from pace.rl.train import main as train
+from pace.runs.own_files import LIST
 from pace.runs.run_folder import RunFolder, make_out
 from pace.studies.__main__ import main as studies
 from pace.studies.ablate import main as ablate
+from pace.studies.ball import main as validate
+from pace.studies.compare import main as compare
+from pace.viewer.__main__ import main as play
 from tests.helpers.outside import SMALL, command
 
 
@@ -97,3 +102,85 @@ def test_the_command_names_the_file(tmp_path: Path, capsys: pytest.CaptureFixtur
     (tmp_path / "metrics.csv").write_text("day,weight\n1,70\n")
     assert command(train, f"out={tmp_path}", *SMALL) == 2
     assert f"{tmp_path / 'metrics.csv'} is no file of a run" in capsys.readouterr().err
+
+
+def test_files_of_others_are_not_replaced_and_own_ones_are(tmp_path: Path) -> None:
+    (tmp_path / "notes.md").write_text("mine")
+    with pytest.raises(ConfigError, match=r"notes.md is no file that pace has written there, and is not replaced"):
+        make_out(str(tmp_path), "x", ["table.csv", "notes.md"])
+    assert [file.name for file in tmp_path.iterdir()] == ["notes.md"]
+    make_out(str(tmp_path), "x", ["table.csv"])
+    (tmp_path / "table.csv").write_text("ours")
+    make_out(str(tmp_path), "y", ["figure.png", "table.csv"])  # another command may write there too
+    (tmp_path / "figure.png").write_text("ours")
+    make_out(str(tmp_path), "x", ["table.csv", "figure.png"])
+    assert (tmp_path / LIST).read_text().split() == ["figure.png", "table.csv"]
+    assert (tmp_path / "notes.md").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "own"),
+    [
+        ("evaluation.json", b'{"rows": [], "versions": {}}', True),
+        ("sweep.json", b'{"cells": []}', True),
+        ("bench.json", b'{"packages": {}, "git": null}', True),
+        ("baseline_seed1.csv", b"update,samples,wall_s\n1,64,0.1\n", True),
+        ("policy.onnx", b"..joint_names..nominal_pose..action_scale", True),
+        ("evaluation.json", b'{"rows": []}', False),
+        ("evaluation.json", b"[1", False),
+        ("evaluation.json", b"\xff\xfe", False),
+        ("policy.onnx", b"another network", False),
+        ("data.csv", b"day,weight\n1,70\n", False),
+        ("figure.png", b"\x89PNG", False),
+    ],
+)
+def test_a_folder_of_before_there_was_a_list_is_known_by_its_content(
+    name: str, content: bytes, own: bool, tmp_path: Path
+) -> None:
+    (tmp_path / name).write_bytes(content)
+    (tmp_path / "page.md").write_text("beside it")
+    if own:
+        make_out(str(tmp_path), "x", [name, "page.md"])
+    else:
+        with pytest.raises(ConfigError, match=f"{name} is no file that pace has written"):
+            make_out(str(tmp_path), "x", [name, "page.md"])
+
+
+#: A sweep of one cell.
+FEW = ("reality=null", "variations.ball=[paper]", "variations.engine=[]", "first_ball=[]")
+FEW += tuple(f"variations.{name}=[]" for name in ("noise", "latency", "friction", "trunk_mass", "gain"))
+
+
+@pytest.mark.parametrize(
+    ("main", "arguments", "name"),
+    [
+        (evaluate, ("policy=zero", "rows=[mixed]"), "evaluation.md"),
+        (evaluate, ("policy=zero", "rows=[]", "--sweep", *FEW), "sweep.png"),
+        (bench, ("bench=quick",), "bench.json"),
+        (ablate, ("samples=1e12", "seeds=[1]"), "ablation.png"),
+        (ablate, ("samples=1e12", "seeds=[1]"), "baseline_seed1.csv"),
+        (studies, ("parity", "architecture"), "architecture.png"),
+        (export, ("pretrained/pace",), "policy.onnx"),
+        (compare, ("docs/results/recipe/steps_12_seed1.csv",), "compare.md"),
+        (validate, (), "presets.png"),
+        (play, ("pretrained/pace", "--video", "{folder}/film.mp4"), "film.mp4"),
+    ],
+)
+def test_every_command_asks_before_its_work(
+    main, arguments: tuple[str, ...], name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / name).write_text("mine")
+    if main is not play:
+        arguments = (*arguments, f"out={tmp_path}")
+    assert command(main, *(each.format(folder=tmp_path) for each in arguments)) == 2
+    assert f"{tmp_path / name} is no file that pace has written there" in capsys.readouterr().err
+    assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [(name, "mine")]
+
+
+def test_an_evaluation_may_be_repeated_in_its_folder(tmp_path: Path) -> None:
+    small = ("policy=zero", "rows=[short]", "serves=2", "num_worlds=2", "warmup_serves=0", "physics_dt=0.02")
+    small += ("first_ball=[]", "progress=false", "serve.max_duration=0.3", "device=cpu", f"out={tmp_path}")
+    assert command(evaluate, *small) == 0
+    assert command(evaluate, *small) == 0
+    written = {file.name for file in tmp_path.iterdir()} - {LIST}
+    assert written == set((tmp_path / LIST).read_text().split())

@@ -12,6 +12,7 @@ from pace.config.base import compose, parse, to_dict
 from pace.config.training import TrainConfig
 from pace.rl.train import main as train
 from pace.runs.metrics import Milestone, passage, read_curve, read_metrics
+from pace.runs.own_files import LIST
 from pace.studies import learning_curves
 from pace.studies.__main__ import main as studies
 from pace.studies.ablation import run_name
@@ -164,4 +165,4 @@ def test_the_command_prints_the_tables_of_the_pages(
     printed = set(capsys.readouterr().out.splitlines())
     page = (RESULTS / "recipe.md").read_text().splitlines()
     assert {line for line in page if line.startswith(("| steps_12 |", "| campaign |"))} <= printed
-    assert {file.name for file in tmp_path.iterdir()} == {"recipe.png", "learning.png"}
+    assert {file.name for file in tmp_path.iterdir()} == {"recipe.png", "learning.png", LIST}

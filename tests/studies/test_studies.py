@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from pace.rl.policies import load_policy
+from pace.runs.own_files import LIST
 from pace.studies import motors, parity, reaction, steps
 from pace.studies.__main__ import main
 from pace.studies.swings import Swings, policy_swings, random_swings
@@ -152,5 +153,5 @@ def test_the_commands_print_tables_and_write_figures(
     printed = capsys.readouterr().out
     assert printed.count("\n| ") >= 2 + len(reaction.SPEEDS) + 2 + 2 * len(found) + 4
     assert "0.20 ms a control step" in printed
-    assert {path.name for path in tmp_path.iterdir()} == {"paddle_reaction.png", "engine_parity.png"}
+    assert {path.name for path in tmp_path.iterdir()} == {"paddle_reaction.png", "engine_parity.png", LIST}
     assert all(path.stat().st_size > 10_000 for path in tmp_path.iterdir())

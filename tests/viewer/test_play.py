@@ -167,7 +167,7 @@ def test_bad_input_is_one_line(
         port = taken.getsockname()[1]
         for arguments, status, message in (
             (["/nowhere"], 1, "does not exist"),
-            ([], 2, "which run?"),
+            (["run=null"], 2, "which run?"),
             ([policy.source, f"port={port}"], 1, f"port {port} of 127.0.0.1 cannot be opened"),
             ([policy.source, "host=nobody.invalid"], 1, "of nobody.invalid cannot be opened"),
             ([policy.source, "ball=wood"], 2, "wood"),
