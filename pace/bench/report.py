@@ -12,6 +12,7 @@ from typing import Any
 import torch
 
 from pace.cores import usable_cores
+from pace.runs.files import write_whole
 
 FILE = "bench.json"
 
@@ -93,4 +94,4 @@ def _cpu_name() -> str:
 def write(path: Path, figures: dict[str, float | None], context: dict[str, Any]) -> None:
     """``bench.json``: the figures by name, their ratios, and the circumstances."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({**figures, "ratios": ratios(figures), **context}, indent=1) + "\n", encoding="utf-8")
+    write_whole(path, json.dumps({**figures, "ratios": ratios(figures), **context}, indent=1) + "\n")

@@ -12,6 +12,7 @@ from torch import Tensor
 from pace.config.ball import TableConfig
 from pace.evaluation.records import C, rates
 from pace.evaluation.serves import PATH_STEPS, Row
+from pace.runs.files import write_figure
 from pace.task.game import Outcome
 
 if TYPE_CHECKING:
@@ -257,5 +258,5 @@ def write_figures(
         BALLS: ball_figure(rows, warmup_serves),
     }
     for name, figure in figures.items():
-        figure.savefig(folder / name, dpi=DPI)
+        write_figure(folder / name, figure, dpi=DPI)
     return [folder / name for name in figures]

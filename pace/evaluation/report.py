@@ -141,12 +141,13 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 def write_serves(path: Path, rows: Sequence[Row]) -> None:
     """Every counted serve, one per line: its range, then ``COLUMNS``."""
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(("serve", *COLUMNS))
-        for row in rows:
-            for record in row.records.tolist():
-                writer.writerow([row.serve, *("" if math.isnan(value) else f"{value:.6g}" for value in record)])
+    text = io.StringIO()
+    writer = csv.writer(text)
+    writer.writerow(("serve", *COLUMNS))
+    for row in rows:
+        for record in row.records.tolist():
+            writer.writerow([row.serve, *("" if math.isnan(value) else f"{value:.6g}" for value in record)])
+    write_whole(path, text.getvalue())
 
 
 def write_report(

@@ -24,6 +24,7 @@ from pace.evaluation.figures import DPI, heat_map
 from pace.evaluation.report import write_json
 from pace.evaluation.serves import EvaluationError
 from pace.rl.policies import TaskPolicy
+from pace.runs.files import write_figure
 
 JSON, MAP = "sweep.json", "sweep.png"
 FILES = (JSON, MAP)
@@ -207,22 +208,19 @@ def cells_to_play(cells: Sequence[Cell], finished: Tables) -> list[Cell]:
 def write_sweep(folder: Path, cells: Sequence[Cell], tables: Tables, context: Mapping[str, Any]) -> list[Path]:
     """``sweep.json`` and the heat map in ``folder``, of those ``cells`` that ``tables`` has the rows of.
 
-    Each file is written under another name first, so that an interruption leaves the previous one intact.
+    An interruption leaves the previous file intact.
     """
     done = [cell for cell in cells if cell.key in tables]
     entries = [_entry(cell, tables[cell.key]) for cell in done]
     files = [folder / name for name in FILES]
     folder.mkdir(parents=True, exist_ok=True)
-    parts = [file.with_name(f"part_{file.name}") for file in files]
-    write_json(parts[0], {"cells": entries, **context})
+    write_json(files[0], {"cells": entries, **context})
     figure = heat_map(
         [(cell.variation.kind, cell.variation.label) for cell in done],
         [tables[cell.key] for cell in done],
         f"{context['policy']}: one change at a time; engine {context['engine']} unless changed",
     )
-    figure.savefig(parts[1], dpi=DPI)
-    for part, file in zip(parts, files, strict=True):
-        part.replace(file)
+    write_figure(files[1], figure, dpi=DPI)
     return files
 
 

@@ -6,9 +6,14 @@ import os
 import sys
 from collections.abc import Callable
 from contextlib import suppress
+from io import BytesIO
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 LARGEST_WAITING = 64 * 2**20  # bytes that wait in memory for a disk to be written again
 
@@ -47,6 +52,13 @@ def write_whole(file: Path, content: str | bytes) -> None:
     except OSError:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def write_figure(file: Path, figure: Figure, dpi: int, **options: Any) -> None:
+    """:func:`write_whole` a figure of matplotlib, as a PNG. Errors: ``OSError``."""
+    picture = BytesIO()
+    figure.savefig(picture, dpi=dpi, format="png", **options)
+    write_whole(file, picture.getvalue())
 
 
 class AppendFile:

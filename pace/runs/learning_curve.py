@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pace.runs.files import reason, say, write_whole
+from pace.runs.files import reason, say, write_figure
 from pace.runs.metrics import read_metrics
 
 if TYPE_CHECKING:
@@ -73,10 +72,8 @@ def plot_learning_curve(run: str | Path) -> Path | None:
         axes.legend(loc="best")
     axes.set_xlabel(f"control steps, millions (mean of {CURVE_WINDOW} updates)")
     file = Path(run) / CURVE
-    picture = BytesIO()
-    figure.savefig(picture, dpi=110)
     try:
-        write_whole(file, picture.getvalue())
+        write_figure(file, figure, dpi=110)
     except OSError as error:
         say(f"warning: {file} cannot be written: {reason(error)}")
         return None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,6 +11,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+
+from pace.runs.files import write_whole
 
 Array = NDArray[np.float64]
 
@@ -167,12 +170,13 @@ def write_slim(source: str | Path, target: str | Path, every: int = SLIM_ROWS) -
     metrics = read_metrics(source, SLIM_COLUMNS)
     names = [name for name in SLIM_COLUMNS if name in metrics]
     count = len(metrics.get("samples", ()))
-    with Path(target).open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(names)
-        for start in range(0, count, every):
-            block = {name: np.array(metrics[name][start : start + every]) for name in names}
-            writer.writerow(f"{_pooled(name, block):.8g}".replace("nan", "") for name in names)
+    text = io.StringIO()
+    writer = csv.writer(text)
+    writer.writerow(names)
+    for start in range(0, count, every):
+        block = {name: np.array(metrics[name][start : start + every]) for name in names}
+        writer.writerow(f"{_pooled(name, block):.8g}".replace("nan", "") for name in names)
+    write_whole(Path(target), text.getvalue())
     return Path(target)
 
 

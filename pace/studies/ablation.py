@@ -17,6 +17,7 @@ from omegaconf import DictConfig
 
 from pace.config.base import parse
 from pace.config.commands import AblateConfig
+from pace.runs.files import write_figure
 from pace.runs.metrics import MILESTONES, Array, Curve, Milestone, markdown, passage, read_curve, write_slim
 from pace.runs.own_files import make_out
 from pace.runs.queue import Run, RunQueue, check_settings
@@ -162,7 +163,7 @@ def draw(curves: Curves, file: Path) -> Path:
         axes.set_ylim(bottom=0)
         axes.grid(alpha=0.3)
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside right upper", fontsize=8)
-    figure.savefig(file, dpi=DPI)
+    write_figure(file, figure, dpi=DPI)
     return file
 
 

@@ -16,6 +16,7 @@ from matplotlib.patches import FancyBboxPatch
 
 import pace
 from pace.command.table import COMMANDS
+from pace.runs.files import write_figure
 
 ROOT = Path(pace.__file__).parent
 #: Files beside the rooms that are no part of the picture: the package itself, and the list of commands that moved.
@@ -203,5 +204,5 @@ def write(out: Path, rooms: Mapping[str, Room] | None = None) -> Path:
     """Draw ``architecture.png`` into the folder ``out``."""
     rooms = rooms or read_rooms()
     file = out / "architecture.png"
-    draw(rooms).savefig(file, dpi=100, metadata={"Description": described(rooms)})
+    write_figure(file, draw(rooms), dpi=100, metadata={"Description": described(rooms)})
     return file

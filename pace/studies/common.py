@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pace.config.training import TrainConfig, load_train_config
+from pace.runs.files import write_figure
 from pace.sim.engine.native import stop_timers
 from pace.sim.robot import build_model
 from pace.sim.robot_spec import RobotSpec
@@ -98,7 +99,7 @@ def save_figure(file: Path, size: tuple[float, float], draw: Callable[[Figure], 
     with plt.rc_context({"axes.spines.top": False, "axes.spines.right": False, "font.size": 9}):
         figure = plt.figure(figsize=size, layout="constrained")
         draw(figure)
-        figure.savefig(file, dpi=90)
+        write_figure(file, figure, dpi=90)
         plt.close(figure)
     print(f"wrote {file}")
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
+from pace.runs.files import write_figure
 from pace.runs.metrics import Curve, Milestone, markdown, passage, read_curve
 
 RECIPE = "return_velocity"
@@ -49,5 +50,5 @@ def draw(curves: Mapping[str, Curve], file: Path) -> Path:
         axes.set(title=title, xlabel="control steps (millions)", ylim=(0, 1))
         axes.grid(alpha=0.3)
     panels[0].legend()
-    figure.savefig(file, dpi=110)
+    write_figure(file, figure, dpi=110)
     return file

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
+from pace.runs.files import write_figure
 from pace.runs.metrics import MILESTONES, Curve, markdown, passage, passage_text, read_curve, write_slim
 from pace.runs.run_folder import METRICS
 from pace.studies.ablation import run_name
@@ -90,5 +91,5 @@ def draw(curves: Mapping[Tried, Curve], file: Path) -> Path:
         axes.grid(alpha=0.3)
     panels[-1].set_xlabel("control steps, millions")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right upper", fontsize=8)
-    figure.savefig(file, dpi=100)
+    write_figure(file, figure, dpi=100)
     return file

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from itertools import chain
 from pathlib import Path
@@ -69,7 +70,7 @@ def write_video(
     height: int,
     on_picture: Callable[[], None] = lambda: None,
 ) -> None:
-    """Write a video as H.264.
+    """Write a video as H.264; what was there is replaced when it is complete.
 
     Errors: :class:`pace.sim.render.RenderError` if OpenGL or a package is missing, or the file cannot be written.
     """
@@ -79,16 +80,23 @@ def write_video(
         raise RenderError(f"{error}: pip install 'pace-table-tennis[viewer]'") from error
     film = pictures(show, seconds, fps, speed, width, height)
     first = next(film)  # fails without OpenGL, before the file is made
+    part = file.with_name(f".{file.stem}.{os.getpid()}.tmp{file.suffix}")  # the encoder goes by the suffix
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        file.touch()  # the encoder would only report a broken pipe
+        part.touch()  # the encoder would only report a broken pipe
         writer = imageio_ffmpeg.write_frames(
-            str(file), (width, 2 * height), fps=fps, codec="libx264", quality=7, macro_block_size=BLOCK
+            str(part), (width, 2 * height), fps=fps, codec="libx264", quality=7, macro_block_size=BLOCK
         )
         writer.send(None)
         for picture in chain([first], film):
             writer.send(np.ascontiguousarray(picture))
             on_picture()
-        writer.close()
+        writer.close()  # which does not tell whether the encoder could write the end
+        written = imageio_ffmpeg.read_frames(str(part))
+        next(written)
+        written.close()
+        part.replace(file)
     except OSError as error:
         raise RenderError(f"{file} cannot be written: {str(error).strip().splitlines()[0]}") from error
+    finally:
+        part.unlink(missing_ok=True)

@@ -12,10 +12,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from pace.runs.files import AppendFile, write_whole
-from pace.runs.metrics import read_metrics
+from pace.bench import report as bench
+from pace.evaluation.report import write_serves
+from pace.runs.files import AppendFile, write_figure, write_whole
+from pace.runs.metrics import read_metrics, write_slim
 from pace.runs.metrics_file import EventsFile, MetricsFile, read_rows
 from pace.runs.run_folder import RunFolder
 
@@ -148,6 +151,48 @@ def test_a_file_that_cannot_be_replaced_is_not_cut(tmp_path: Path, monkeypatch: 
     with pytest.raises(OSError, match="No space left"):
         MetricsFile(file, 1)
     assert file.read_text() == before
+
+
+def write_serves_of_nobody(file: Path) -> None:
+    write_serves(file, [])
+
+
+def write_slim_of_one_row(file: Path) -> None:
+    (file.parent / "metrics.csv").write_text("update,samples\n1,96\n")
+    write_slim(file.parent / "metrics.csv", file)
+
+
+def write_bench(file: Path) -> None:
+    bench.write(file, {}, {})
+
+
+def write_empty_figure(file: Path) -> None:
+    write_figure(file, Figure(), dpi=10)
+
+
+@pytest.mark.parametrize("write", [write_serves_of_nobody, write_slim_of_one_row, write_bench, write_empty_figure])
+def test_results_are_written_whole_or_not_at_all(
+    write: Callable[[Path], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "result"
+    file.write_text("an hour's work")
+
+    def full(handle: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", full)
+        with pytest.raises(OSError, match="No space left"):
+            write(file)
+    assert file.read_text() == "an hour's work"
+    assert not list(tmp_path.glob(".*"))
+    write(file)
+    assert file.read_bytes() != b"an hour's work"
+
+
+def test_no_other_code_writes_a_figure() -> None:
+    found = [path for path in Path("pace").rglob("*.py") if ".savefig(" in path.read_text(encoding="utf-8")]
+    assert found == [Path("pace/runs/files.py")]
 
 
 def test_rows_of_text_that_is_no_metrics() -> None:

@@ -7,6 +7,7 @@ import socket
 import sys
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from pace.runs.checkpoint_folders import list_checkpoints
 from pace.sim import render
 from pace.sim.ball.ball import ball_preset
 from pace.sim.render import RenderError
+from pace.viewer import video
 from pace.viewer.__main__ import main
 from pace.viewer.playback import Score, Serve, Show
 from pace.viewer.video import write_video
@@ -150,6 +152,24 @@ def test_a_film_has_all_its_pictures(policy: TaskPolicy, tmp_path: Path) -> None
     assert count == len(seen) == 8  # 0.1 s of play, four times slower, 20 a second
     assert seconds == pytest.approx(0.4, abs=0.06)
     assert next(ffmpeg.read_frames(str(file)))["size"] == (128, 128)
+
+
+def test_a_film_that_is_not_finished_leaves_the_old_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The encoder says nothing of a disk that is full at its end."""
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+
+    def cut(path: str, *_: object, **__: object) -> Iterator[None]:
+        Path(path).write_bytes(b"\0" * 1000)
+        with suppress(GeneratorExit):
+            while True:
+                yield
+
+    monkeypatch.setattr(ffmpeg, "write_frames", cut)
+    monkeypatch.setattr(video, "pictures", lambda *_: iter([np.zeros((128, 64, 3), np.uint8)] * 2))
+    (tmp_path / "out.mp4").write_text("the old film")
+    with pytest.raises(RenderError, match=r"out.mp4 cannot be written"):
+        write_video(tmp_path / "out.mp4", standing(), 0.1, 20, 1.0, 64, 64)
+    assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("out.mp4", "the old film")]
 
 
 def run_main(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
