@@ -12,8 +12,7 @@ from pace.config.base import ConfigError, compose, parse
 from pace.config.commands import EvaluateConfig, PaperRow
 from pace.config.judge import JudgeConfig
 from pace.evaluation.evaluate import circumstances
-from pace.evaluation.figures import FILES as FIGURES
-from pace.evaluation.figures import write_figures
+from pace.evaluation.figures import FIGURES, write_figures
 from pace.evaluation.report import FILES as REPORT
 from pace.evaluation.report import write_report
 from pace.evaluation.serves import EvaluationError, Row, evaluate_row
