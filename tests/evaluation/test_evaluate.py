@@ -506,7 +506,7 @@ def test_an_evaluation_that_is_stopped_in_its_second_row_keeps_the_first(
     rows = json.loads((tmp_path / "evaluation.json").read_text())["rows"]
     assert [(row["serve"], row["serves"] >= 2) for row in rows] == [("short", True)]
     assert len((tmp_path / "evaluation.csv").read_text().splitlines()) == 2
-    assert not list(tmp_path.glob(".*"))
+    assert [file.name for file in tmp_path.glob(".*")] == [LIST]
 
 
 def test_a_full_disk_leaves_the_cells_of_a_sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
