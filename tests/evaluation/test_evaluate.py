@@ -435,7 +435,11 @@ def test_a_file_that_is_no_sweep_is_left_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "sweep.json").write_text("[1]")
-    assert run_main(monkeypatch, "policy=zero", f"out={tmp_path}", *SWEEP, "variations.gain=[]") == 1
+    command = ["policy=zero", f"out={tmp_path}", *SWEEP, "variations.gain=[]"]
+    assert run_main(monkeypatch, *command) == 2
+    assert "sweep.json is no file that pace has written there" in capsys.readouterr().err
+    (tmp_path / LIST).write_text("sweep.json\nsweep.png\n")  # it was one, and an editor has changed it
+    assert run_main(monkeypatch, *command) == 1
     assert "sweep.json is no file of a sweep" in capsys.readouterr().err
     assert (tmp_path / "sweep.json").read_text() == "[1]"
 
