@@ -41,8 +41,8 @@ def slurm(tmp_path: Path) -> dict[str, str]:
 def submit(job: dict[str, str], folder: Path, *arguments: str) -> subprocess.Popen[str]:
     """The script as Slurm runs it, in ``folder``."""
     line = ["bash", str(SCRIPT), *arguments]
-    piped = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    return subprocess.Popen(line, cwd=folder, env=job, text=True, **piped)
+    pipe = subprocess.PIPE
+    return subprocess.Popen(line, cwd=folder, env=job, text=True, stdout=pipe, stderr=pipe)
 
 
 @pytest.mark.slow
