@@ -25,12 +25,13 @@ from pace.config.base import ConfigError, also_from, compose, config_dir, meant
 from pace.config.names import check_choice, split_override
 from pace.cores import core_set, usable_cores
 
-#: Errors of a disk and of permissions, which are no fault of the program.
+#: Errors of a disk, of permissions and of folders that were deleted or replaced, which are no fault of the program.
 DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EACCES, errno.EPERM, errno.EIO)
+DISK += (errno.ENOENT, errno.ENOTDIR, errno.ESTALE)
 EXIT_USAGE = 2
 EXIT_FAILED = 1
 EXIT_INTERRUPTED = 130
-EXIT_TERMINATED = 75  # EX_TEMPFAIL: the work was saved, and the same command, or resume=, continues it
+EXIT_TERMINATED = 75  # EX_TEMPFAIL: what there was is saved; the same command, or resume=, starts or continues it
 
 
 class Terminated(KeyboardInterrupt):
@@ -73,10 +74,21 @@ def _run(name: str) -> int:
         return complain(explain(name, sys.argv[1:], error), EXIT_USAGE)
     except JobFailed as error:
         return error.status
+    except OSError as error:  # of Hydra, which asks for the current folder
+        return _of_disk(error)
     except Terminated:
         return EXIT_TERMINATED
     except KeyboardInterrupt:
         return complain("interrupted", EXIT_INTERRUPTED)
+
+
+def _of_disk(error: OSError) -> int:
+    """Print an error of the disk; returns the exit status. Errors: ``error`` itself if it is another one."""
+    if error.errno not in DISK:
+        raise error
+    if error.errno == errno.ENOENT and error.filename is None:  # of os.getcwd()
+        return complain("the current folder was deleted: change to one that exists", EXIT_FAILED)
+    return complain(": ".join(str(part) for part in (error.filename, error.strerror) if part), EXIT_FAILED)
 
 
 def _limit_threads() -> None:
@@ -147,9 +159,7 @@ def _work(command: Command, config: DictConfig) -> int:
     except tuple(failures) as error:
         return complain(str(error), EXIT_FAILED)
     except OSError as error:
-        if error.errno not in DISK:
-            raise
-        return complain(": ".join(filter(None, (error.filename, error.strerror))), EXIT_FAILED)
+        return _of_disk(error)
     except RuntimeError as error:
         return complain(_full_memory(error), EXIT_FAILED)
     return 0

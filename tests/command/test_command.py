@@ -298,6 +298,30 @@ def test_a_full_gpu_is_one_line_and_other_errors_stay(
         run_command("validate")
 
 
+@pytest.mark.parametrize("code", [errno.ENOENT, errno.ENOTDIR, errno.ESTALE])
+def test_a_folder_that_is_lost_under_a_command_is_one_line(
+    code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def work(config: object) -> None:
+        raise OSError(code, os.strerror(code), "runs/mine")
+
+    monkeypatch.setattr("pace.command.run.resolve_name", lambda _: work)
+    monkeypatch.setattr(sys, "argv", ["validate"])
+    assert run_command("validate") == 1
+    assert capsys.readouterr().err == f"error: runs/mine: {os.strerror(code)}\n"
+
+
+def test_a_deleted_current_folder_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    monkeypatch.setattr(sys, "argv", ["validate"])
+    assert run_command("validate") == 1
+    assert capsys.readouterr().err == "error: the current folder was deleted: change to one that exists\n"
+
+
 def test_a_terminated_command_has_its_own_status(monkeypatch: pytest.MonkeyPatch) -> None:
     def work(config: object) -> None:
         raise Terminated
