@@ -192,9 +192,12 @@ def out_of_memory(error: BaseException) -> bool:
     return isinstance(error, RuntimeError) and full is not None and "memory pools are not" not in text
 
 
-def full_memory_in_words() -> str:
-    """One line for :func:`out_of_memory`, with the number of worlds that fit by estimate."""
-    free, total = (size / GIB for size in torch.cuda.mem_get_info())
+def full_memory_in_words(error: BaseException, device: torch.device | None = None) -> str:
+    """One line for an error that is :func:`out_of_memory`, with the number of worlds that fit by estimate. The GPU is
+    the one that the error names; if it names none, ``device``, or else torch's current one."""
+    named = re.search(r"\bGPU (\d+) has|on device 'cuda:(\d+)'", str(error))
+    full = device if named is None else torch.device("cuda", int(named[1] or named[2]))
+    free, total = (size / GIB for size in torch.cuda.mem_get_info(full))
     fit = f"by estimate a training run of {most_worlds(total):,} worlds fits if nothing else runs there"
     return f"the GPU's memory is full ({total:.1f} GiB, {free:.1f} free): {fit}; give a smaller num_worlds"
 

@@ -9,7 +9,15 @@ import torch
 
 from pace import devices
 from pace.config.base import ConfigError
-from pace.devices import Card, SeenByTorch, SeenByWarp, has_code_for, out_of_memory, resolve_device
+from pace.devices import (
+    Card,
+    SeenByTorch,
+    SeenByWarp,
+    full_memory_in_words,
+    has_code_for,
+    out_of_memory,
+    resolve_device,
+)
 
 H200 = Card("NVIDIA H200", (9, 0), ("sm_80", "sm_90", "sm_120"))
 WARP = SeenByWarp("1.19.0", (13, 4), (13, 0), 2, 75)  # a driver of the same generation is new enough
@@ -145,3 +153,17 @@ def test_a_full_memory_is_told_from_other_errors() -> None:
         ValueError("CUDA error: out of memory"),
     )  # fmt: skip
     assert [out_of_memory(error) for error in (*full, *other)] == [True, True, False, False, False]
+
+
+def test_the_memory_is_that_of_the_gpu_that_was_full(monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes = {None: 8, "cuda:0": 24, "cuda:1": 80, "cuda:12": 12}
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda on: (2**29, sizes[on and str(on)] * 2**30))
+    runs = torch.device("cuda:0")
+    for error, size in (
+        (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 9.00 GiB. GPU 1 has a total capacity of"), 80),
+        (RuntimeError("Failed to allocate 4194304 bytes on device 'cuda:12'"), 12),
+        (RuntimeError("CUDA error: out of memory"), 24),
+    ):
+        assert out_of_memory(error)
+        assert full_memory_in_words(error, runs).startswith(f"the GPU's memory is full ({size}.0 GiB, 0.5 free): by")
+    assert "(8.0 GiB" in full_memory_in_words(RuntimeError("CUDA error: out of memory"))  # torch's current one

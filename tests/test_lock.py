@@ -54,6 +54,13 @@ def test_what_the_project_needs_is_locked() -> None:
     assert {"imageio", "imageio-ffmpeg", "setuptools"} <= set(locked)
 
 
+def test_torch_of_the_figures_of_a_gpu_is_admitted() -> None:
+    """docs/results/gpu.md: 2.11; requirements.lock: 2.13."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    (torch,) = (packaging.Requirement(text) for text in project["dependencies"] if text.startswith("torch>"))
+    assert [torch.specifier.contains(version) for version in ("2.11.0", "2.13.0", "2.14.0")] == [True, True, False]
+
+
 def test_a_gpus_libraries_are_apart() -> None:
     cuda = entries("requirements-cuda.lock")
     assert not set(cuda) & set(entries("requirements.lock"))

@@ -39,6 +39,14 @@ class Target(NamedTuple):
     arch: int | None = None
 
 
+_rehearsals = 0  # that run now
+
+
+def rehearsing() -> bool:
+    """Whether launches are noted only: what waits for their results would wait for ever."""
+    return _rehearsals > 0
+
+
 class SilentLaunch:
     """In place of a recorded launch."""
 
@@ -85,8 +93,13 @@ def rehearsal(of_a_gpu: bool = False) -> Iterator[list[Wanted]]:
     ]
     if of_a_gpu:
         replacements.append((context, "_resolve_launch_block_dim", lambda _device, asked: int(asked or GPU_BLOCK)))
+    global _rehearsals
     with replaced(*replacements), as_one():
-        yield found
+        _rehearsals += 1
+        try:
+            yield found
+        finally:
+            _rehearsals -= 1
 
 
 def missing(wanted: Sequence[Wanted], target: Target) -> list[Wanted]:

@@ -136,7 +136,7 @@ def _full_memory(error: RuntimeError) -> str:
 
     if not out_of_memory(error):
         raise error
-    return full_memory_in_words()
+    return full_memory_in_words(error)
 
 
 def _work(command: Command, config: DictConfig) -> int:

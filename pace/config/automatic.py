@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
 
-from pace.config.base import ConfigError, config_dir, parse
+from pace.config.base import ConfigError, config_dir, parse, require
 
 AUTO = "auto"
 SHARE_OF_MEMORY = 0.8  # that a run may fill; the rest is for what else runs there, and for a GPU's driver
@@ -28,10 +28,15 @@ class DeviceValues:
     num_worlds: int  # for each device
     steps: int
     minibatches: int
+    autocast: str  # on hardware with units for bf16; fp32 on any other
     samples: float  # control steps of a run, if neither its samples nor its minutes are given
     minutes: float
     memory: float  # GiB, of each process of a run without worlds
     memory_per_world: float  # GiB
+
+    def __post_init__(self) -> None:
+        known = ("mixed", "bf16", "fp32")
+        require(self.autocast in known, f"autocast must be one of {', '.join(known)}, not {self.autocast!r}")
 
 
 class Machine(NamedTuple):
@@ -62,7 +67,7 @@ def choose(composed: DictConfig, machine: Machine) -> tuple[DictConfig, dict[str
 
 def in_words(chosen: dict[str, Any]) -> str:
     """The chosen values in one line."""
-    return ", ".join(KEYS[key].format(value) for key, value in chosen.items())
+    return ", ".join(KEYS.get(key, f"{key}={{}}").format(value) for key, value in chosen.items())
 
 
 def left_open(composed: DictConfig) -> set[str]:
@@ -107,8 +112,13 @@ def _values(given: DeviceValues, machine: Machine) -> dict[str, Any]:
     worlds = _worlds_that_fit(given, machine.memory) * machine.count
     values: dict[str, Any] = {"num_worlds": worlds, "algo.steps": given.steps, "algo.minibatches": given.minibatches}
     if machine.bf16 is not None:
-        values["algo.autocast"] = "mixed" if machine.bf16 else "fp32"
+        values["algo.autocast"] = number_format(machine.kind, machine.bf16)
     return values
+
+
+def number_format(kind: str, bf16: bool) -> str:
+    """What ``algo.autocast=auto`` stands for on a ``kind`` of device, cpu or cuda, with units for ``bf16`` or not."""
+    return device_values(kind).autocast if bf16 else "fp32"
 
 
 def most_worlds(memory: float) -> int:

@@ -227,15 +227,9 @@ class CompareConfig:
         require(len(self.runs) > 0, "which runs? give run folders, checkpoints, pretrained/<name> or CSVs")
         for run in self.runs:
             require(self.runs.count(run) == 1, f"{run} is given twice")
-        require(self.window > 0, f"window must be positive, got {self.window}")
         require(self.figure.endswith(".png"), f"figure must end in .png, got {self.figure}")
         require(len(self.rows) > 0, "rows must name at least one serve range; play=false plays none")
         require(self.task in ("table", "own"), f"task must be table or own, not {self.task!r}")
-        for name in ("serves", "balls_per_world"):
-            require(getattr(self, name) >= 1, f"{name} must be at least 1, got {getattr(self, name)}")
-        given = self.num_worlds is None or self.num_worlds >= 1
-        require(given, f"num_worlds must be null or at least 1, got {self.num_worlds}")
-        require(self.warmup_serves >= 0, f"warmup_serves must not be negative, got {self.warmup_serves}")
 
     @property
     def worlds(self) -> int:
@@ -282,4 +276,3 @@ class StudiesConfig:
     def __post_init__(self) -> None:
         for name in ("worlds", "serves"):
             require(getattr(self, name) >= 1, f"{name} must be at least 1, got {getattr(self, name)}")
-        require(0 < self.hours < 1000, f"hours must lie in (0, 1000), got {self.hours}")

@@ -41,7 +41,7 @@ class AlgoConfig:
     max_grad_norm: float
     observation_clip: float
     last_layer_gain: float
-    # mixed (bf16; the actor in fp32 from a std of fp32_below on), bf16, fp32; auto: mixed, or fp32 without bf16
+    # mixed (bf16; the actor in fp32 from a std of fp32_below on), bf16, fp32; auto: by the device
     autocast: str
     later_steps: list[SchedulePoint] = field(default_factory=list)  # in place of steps, from a place in the run on
     fp32_below: float = 0.0  # mean std of the policy below which with autocast=mixed the actor is float32
@@ -169,5 +169,5 @@ def load_train_config(overrides: list[str] | None = None) -> TrainConfig:
 # Another number of processes means new worlds; with out=, a new run folder goes on from the checkpoint.
 RESUME_KEYS = (
     "resume", "samples", "minutes", "checkpoint_minutes", "tensorboard", "progress", "device", "processes", "plugins",
-    "out", "judge.serves", "judge.last_serves", "judge.after", "judge.video",
+    "engine.graph", "out", "judge.serves", "judge.last_serves", "judge.after", "judge.video",
 )  # fmt: skip

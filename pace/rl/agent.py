@@ -17,6 +17,7 @@ from tensordict.nn import (
 from torch import Tensor, nn
 from torchrl.modules import IndependentNormal
 
+from pace.config.automatic import number_format
 from pace.config.base import ConfigError
 from pace.config.training import AlgoConfig
 from pace.devices import has_bf16
@@ -27,9 +28,9 @@ VARIANCE_FLOOR = 1e-4  # the divisor is at least 0.01, so that nearly constant o
 
 
 def compute_dtype(autocast: str, device: torch.device) -> torch.dtype:
-    """Number format of the matrix products: bf16 if configured, or (``auto``) if the hardware supports it."""
-    rounded = has_bf16(device) if autocast == "auto" else autocast in ("bf16", "mixed")
-    return torch.bfloat16 if rounded else torch.float32
+    """Number format of the matrix products: bf16 if configured, or (``auto``) if it is the choice for the device."""
+    chosen = number_format(device.type, has_bf16(device)) if autocast == "auto" else autocast
+    return torch.float32 if chosen == "fp32" else torch.bfloat16
 
 
 class Sizes(NamedTuple):

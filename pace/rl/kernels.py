@@ -73,13 +73,10 @@ def kernels_of_a_gpu(config: TrainConfig) -> list[Wanted]:
 
 
 def kernels_of(config: TrainConfig, device: torch.device, of_a_gpu: bool = False) -> list[Wanted]:
-    """The modules of a run, found in a rehearsal of two worlds for each robot and engine of its stages."""
+    """The modules of a run, found in a rehearsal of two worlds for each of its stages: a robot brings its own, and so
+    do pauses, motion capture and whatever else a stage switches on. All but the first take half a second."""
     found: list[Wanted] = []
-    seen: list[object] = []
     for task in stage_tasks(config):
-        if (task.robot, task.engine) in seen:
-            continue
-        seen.append((task.robot, task.engine))
         found += [each for each in _rehearse(task, device, of_a_gpu) if each not in found]
     return found
 

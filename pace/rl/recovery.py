@@ -128,7 +128,7 @@ class Recovery:
             if not out_of_memory(error) or number == 1:
                 raise
             torch.cuda.empty_cache()
-            raise self._last_words(RolloutError(full_memory_in_words())) from error
+            raise self._last_words(RolloutError(full_memory_in_words(error, env.policy_observation.device))) from error
         self.in_a_row = 0
         if row.get("diverged", 0.0) > 0:
             self._write_replay(env, number, "diverged")

@@ -150,14 +150,26 @@ def machine_for(config: TrainConfig, device: torch.device) -> automatic.Machine:
 
 def adapt(config: TrainConfig, saved: Checkpoint, device: torch.device, overrides: list[str]) -> dict[str, Any]:
     """Fit a resumed run to another kind of device than it was saved on; returns the values that have changed."""
+    given = {override.split("=")[0] for override in overrides}
     if device.type == device_type_of(saved):
-        return {}
-    if not any(key.startswith("processes=") for key in overrides):
+        return _keep_engine(config, saved)
+    changed: dict[str, Any] = {}
+    if "processes" not in given:
         config.processes = 0  # as many as suit this kind of device
-    if config.algo.autocast != "mixed" or has_bf16(device):
+    if "engine.graph" not in given and config.engine.graph == {"cpu": "always", "cuda": "dry"}[device.type]:
+        config.engine.graph = changed["engine.graph"] = "auto"  # what was saved is for the other kind of device
+    if config.algo.autocast == "mixed" and not has_bf16(device):
+        config.algo.autocast = changed["algo.autocast"] = "fp32"
+    return changed
+
+
+def _keep_engine(config: TrainConfig, saved: Checkpoint) -> dict[str, Any]:
+    """The worlds go on in the engine that they are saved in: on a CPU ``engine.graph=dry`` has another one for auto."""
+    was_dry, dry = saved.config["engine"]["graph"] == "dry", config.engine.graph == "dry"
+    if config.engine.name != "auto" or was_dry == dry:
         return {}
-    config.algo.autocast = "fp32"
-    return {"algo.autocast": "fp32"}
+    config.engine.name = "mjwarp" if was_dry else "native"
+    return {"engine.name": config.engine.name}
 
 
 def resumed_config(saved: Checkpoint, path: str, overrides: list[str]) -> TrainConfig:

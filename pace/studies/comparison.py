@@ -15,6 +15,7 @@ from torch import Tensor
 from pace.config.base import parse, require
 from pace.config.commands import CompareConfig
 from pace.config.overrides import override_task
+from pace.devices import resolve_device
 from pace.evaluation.bar import serve_bar
 from pace.evaluation.paired import Paired, compare_records, play_listed
 from pace.evaluation.report import write_json
@@ -127,6 +128,7 @@ def two_policies(config: CompareConfig, runs: Sequence[Given]) -> tuple[TaskPoli
     """The policies of exactly two runs on the task that they play, which is told; None if none are to be played."""
     if not config.play or len(runs) != 2 or not all(run.config for run in runs):
         return None
+    resolve_device(config.device)  # wrong ones raise before the work
     saved = [load_policy(run.path) for run in runs]
     first, second = (policy_on(config.task, policy) for policy in saved)
     for own, played in zip(saved, (first, second), strict=True):

@@ -19,7 +19,7 @@ UPDATES, WORLDS = 2000, 1024
 QUICK = (
     "processes=1", "device=cpu", "engine=native", "engine.threads=1", "engine.physics_dt=0.02", "minutes=0",
     "algo.actor_hidden=[32]", "algo.critic_hidden=[32]", "algo.epochs=1", "predictor.batches_per_update=1",
-    "checkpoint_minutes=0.5", "tensorboard=true", "progress=false",
+    "checkpoint_minutes=0.1", "tensorboard=true", "progress=false",
 )  # fmt: skip
 STEPS = 2  # control steps of an update
 TAIL = 4096  # bytes of metrics.csv: more than a row

@@ -12,6 +12,7 @@ from pace.arrays.draws import Column, UniformSampler, columns_of
 from pace.arrays.graph import may_look
 from pace.arrays.launch import Launch, MaskedLaunch
 from pace.arrays.state import Stateful
+from pace.arrays.warm import rehearsing
 from pace.config.base import ConfigError
 from pace.config.sim import RobotConfig
 from pace.config.task import ResetConfig, ServeConfig
@@ -191,7 +192,7 @@ class ServeSampler(Stateful):
         self._pending.copy_(everyone)
         for _ in range(FIRST_ATTEMPTS):
             self._attempt()
-            if not bool(self._pending.any()):
+            if rehearsing() or not bool(self._pending.any()):
                 return self._repeat(everyone)
         limits = ", ".join(f"serve.{name}={limit}" for name, limit in config.limits().items())
         left = int(self._pending.sum())

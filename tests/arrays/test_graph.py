@@ -1,4 +1,4 @@
-"""A step and a reset as graphs do what they do without: on a CPU in a dry run, on a GPU with CUDA's."""
+"""A step and a reset as graphs do what they do without, on a CPU in a dry run; tests/gpu has CUDA's."""
 
 from __future__ import annotations
 
@@ -11,29 +11,13 @@ import warp as wp
 from torch import Tensor
 
 from pace.arrays import graph
-from pace.arrays.graph import CapturedCall, CudaGraph, Graphs, graphs_of, may_look
-from pace.arrays.launch import Launch
+from pace.arrays.graph import CapturedCall, Graphs, graphs_of, may_look
 from pace.arrays.watch import DryRunError, loads_refused
 from pace.config.base import ConfigError
-from pace.predictor.network import PredictorNetwork
 from pace.task.env import TableTennisEnv
 from tests.helpers.emulation import without_replay
 from tests.helpers.fakes import config
-
-N, STEPS = 4, 50
-PUSHED = (
-    "engine=mjwarp",
-    "randomization.push_interval=[0.02,0.04]",
-    "serve.serves_per_episode=2",
-    "serve.max_duration=0.2",
-)
-
-
-def make(device: str = "cpu", *overrides: str) -> TableTennisEnv:
-    """An environment with a predictor, pushes and short episodes; the same each time."""
-    settings = config(*PUSHED, *overrides)
-    torch.manual_seed(0)
-    return TableTennisEnv(settings, N, device, 1, PredictorNetwork(settings.predictor).to(device))
+from tests.helpers.playing import STEPS, N, make, play
 
 
 def captured(function: Any) -> CapturedCall:
@@ -73,18 +57,6 @@ def test_the_host_may_look_outside_of_what_a_graph_could_hold() -> None:
     CapturedCall(lambda: seen.append(may_look(mask)), torch.device("cpu"), Graphs.NONE)()
     assert seen == [False, True]
     assert not may_look(mask.to("meta"))
-
-
-def play(env: TableTennisEnv, steps: int = STEPS) -> list[dict[str, Any]]:
-    """States after each of some steps under random actions, some worlds being reset besides those that are done."""
-    generator, states = torch.Generator().manual_seed(0), []
-    for _ in range(steps):
-        action = 0.5 * torch.randn(N, 21, generator=generator)
-        extra = torch.rand(N, generator=generator) < 0.05
-        env.advance(action.to(env.worlds.nominal.device))
-        env.reset_worlds(env.terminated | env.truncated | extra.to(env.terminated.device))
-        states.append(env.state_dict())
-    return states
 
 
 @pytest.mark.slow
@@ -144,50 +116,6 @@ def test_graphs_need_a_gpu() -> None:
         graphs_of(config("engine.graph=dry").engine, torch.device("cuda"))
 
 
-@wp.kernel
-def _add(values: wp.array[float], total: wp.array[float]):
-    total[wp.tid()] += values[wp.tid()]
-
-
-needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="captures CUDA graphs")
-
-
-@needs_gpu
-def test_a_cuda_graph_holds_torchs_and_warps_work() -> None:
-    device = torch.device("cuda:0")
-    generator, same = (torch.Generator(device).manual_seed(3) for _ in range(2))
-    drawn, total = torch.zeros(8, device=device), torch.zeros(8, device=device)
-    add = Launch(_add, 8, device, total=total, values=drawn)
-
-    def function(scale: Tensor) -> None:
-        drawn.copy_(scale * torch.rand(8, device=device, generator=generator))
-        add()
-
-    call = CapturedCall(function, device, Graphs.CUDA, generator)
-    expected = torch.zeros(8, device=device)
-    for k in range(6):
-        call(torch.full((8,), float(k), device=device))
-        expected += float(k) * torch.rand(8, device=device, generator=same)
-    assert isinstance(call._graph, CudaGraph)
-    torch.testing.assert_close(total, expected)
-    assert torch.equal(generator.get_state(), same.get_state())
-
-
-@needs_gpu
-def test_cuda_graphs_of_step_and_reset_do_what_the_calls_do() -> None:
-    """The draws are the same to the bit; motion up to what MuJoCo Warp's order of summation on a GPU leaves open."""
-    plain, graphed = make("cuda", "engine.graph=never"), make("cuda", "engine.graph=always")
-    expected, states = play(plain), play(graphed)
-    for call in (graphed._step_in_place, graphed._reset_in_place):
-        assert isinstance(call._graph, CudaGraph)
-    for state, other in zip(states, expected, strict=True):
-        assert torch.equal(state["generator"], other["generator"])
-    for name in ("policy.observation", "rewards.reward", "worlds.position", "worlds.drawn.actuator_delay"):
-        first, second = (torch.stack([state[name] for state in played[:10]]) for played in (states, expected))
-        assert (first - second).abs().median() < 1e-3
-    assert not graphed.worlds.engine.overflowed()
-
-
 class Uncapturable:
     """In place of a CUDA graph: the function runs half, takes random numbers, and the driver gives up."""
 
@@ -244,11 +172,13 @@ def test_a_part_of_what_cannot_be_captured_still_can(monkeypatch: pytest.MonkeyP
 
     count = torch.zeros(())
 
-    def count_on() -> None:
+    def add_one() -> None:
         count.add_(1.0)
 
-    inner = CapturedCall(count_on, torch.device("cpu"), Graphs.TRY)
-    outer_function = lambda: inner()  # noqa: E731  # it must be this object
+    def outer_function() -> None:
+        inner()
+
+    inner = CapturedCall(add_one, torch.device("cpu"), Graphs.TRY)
     outer = CapturedCall(outer_function, torch.device("cpu"), Graphs.TRY)
     monkeypatch.setattr(graph, "CudaGraph", OnlyInner)
     for _ in range(5):

@@ -285,7 +285,7 @@ def test_a_full_gpu_is_one_line_and_other_errors_stay(
     def work(config: object) -> None:
         raise error
 
-    monkeypatch.setattr("torch.cuda.mem_get_info", lambda: (2**29, 8 * 2**30))
+    monkeypatch.setattr("torch.cuda.mem_get_info", lambda _: (2**29, 8 * 2**30))
     monkeypatch.setattr("pace.command.run.resolve_name", lambda _: work)
     monkeypatch.setattr(sys, "argv", ["validate"])
     assert run_command("validate") == 1

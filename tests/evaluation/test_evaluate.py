@@ -435,7 +435,11 @@ def test_a_file_that_is_no_sweep_is_left_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "sweep.json").write_text("[1]")
-    assert run_main(monkeypatch, "policy=zero", f"out={tmp_path}", *SWEEP, "variations.gain=[]") == 1
+    command = ["policy=zero", f"out={tmp_path}", *SWEEP, "variations.gain=[]"]
+    assert run_main(monkeypatch, *command) == 2
+    assert "sweep.json is no file that pace has written there" in capsys.readouterr().err
+    (tmp_path / LIST).write_text("sweep.json\nsweep.png\n")  # it was one, and an editor has changed it
+    assert run_main(monkeypatch, *command) == 1
     assert "sweep.json is no file of a sweep" in capsys.readouterr().err
     assert (tmp_path / "sweep.json").read_text() == "[1]"
 
@@ -506,7 +510,7 @@ def test_an_evaluation_that_is_stopped_in_its_second_row_keeps_the_first(
     rows = json.loads((tmp_path / "evaluation.json").read_text())["rows"]
     assert [(row["serve"], row["serves"] >= 2) for row in rows] == [("short", True)]
     assert len((tmp_path / "evaluation.csv").read_text().splitlines()) == 2
-    assert not list(tmp_path.glob(".*"))
+    assert [file.name for file in tmp_path.glob(".*")] == [LIST]
 
 
 def test_a_full_disk_leaves_the_cells_of_a_sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
-from torch import Tensor, nn
+import torch.distributed as dist
+from torch import nn
 
 from pace.arrays.gradients import Gradients
 from pace.arrays.graph import CapturedCall, CudaGraph, Graphs
@@ -25,6 +25,7 @@ from pace.runs.checkpoint import load_checkpoint
 from pace.runs.metrics import read_metrics
 from pace.runs.optimiser import adam, learning_rate
 from pace.task.env import TableTennisEnv
+from tests.helpers.groups import Echo, connected
 
 pytestmark = [
     pytest.mark.gpu,
@@ -117,11 +118,11 @@ def trainer_of(graph: str, group: ProcessGroup | None = None, *overrides: str) -
 def test_an_update_waits_for_the_device_once(device: torch.device) -> None:
     trainer = trainer_of("always")
     for _ in range(4):
-        trainer.update()
+        trainer._safe_update()
     torch.cuda.set_sync_debug_mode("warn")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        trainer.update()
+        trainer._safe_update()  # as a run does, with what could undo it
     waits = [str(warning.message) for warning in caught if "synchronizing" in str(warning.message)]
     assert len(waits) == 1, waits
 
@@ -137,30 +138,28 @@ def test_captured_updates_learn_what_the_calls_do(device: torch.device) -> None:
         torch.testing.assert_close(second, first, rtol=0.1, atol=1e-3, msg=lambda text, n=name: f"{n}: {text}")
 
 
-class Echo(ProcessGroup):
-    """A group of two with one process: the other has the same numbers."""
-
-    def __init__(self) -> None:
-        super().__init__(0, 2)
-
-    def all_reduce_mean_later(self, tensors: Any) -> Callable[[], None]:
-        return lambda: None
-
-    def all_reduce_sum_(self, tensor: Tensor) -> Tensor:
-        return tensor
-
-    def broadcast_(self, tensors: Any) -> None: ...
-
-    def gather(self, value: Any) -> list[Any]:
-        return [value]
-
-
 def test_a_group_is_captured_up_to_the_exchange(device: torch.device) -> None:
-    """NCCL itself needs two cards."""
+    """With an echo of this process in place of another."""
     trainer = trainer_of("always", Echo(), "algo.observation_norm=false")
     for _ in range(4):
         row = trainer.update()
     assert math.isfinite(row["kl"])
+    assert all(value.isfinite().all() for value in trainer.agent.state_dict().values())
+
+
+def test_a_group_of_one_exchanges_over_nccl(device: torch.device) -> None:
+    """Real messages between the two graphs of an optimiser step, on one card; between two cards nothing was tried.
+    tests/rl/test_dry.py does the same over gloo, bit for bit."""
+    with connected(device) as group:
+        assert "nccl" in dist.get_backend_config()
+        trainer = trainer_of("always", group, "algo.observation_norm=false")
+        for _ in range(6):
+            row = trainer.update()
+        torch.cuda.synchronize()
+        algo = trainer.config.algo
+        assert len(group.messages) > 6 * algo.epochs * algo.minibatches
+    assert row["kl"] > 0
+    assert all(math.isfinite(row[name]) for name in ("kl", "loss_critic", "predictor_rmse_cm"))
     assert all(value.isfinite().all() for value in trainer.agent.state_dict().values())
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import sys
-from collections.abc import Callable
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -33,6 +32,7 @@ from pace.runs.metrics import read_metrics
 from tests.helpers.algo import IN_SAMPLES
 from tests.helpers.dummy import DummyTask
 from tests.helpers.emulation import without_replay
+from tests.helpers.groups import Echo, connected
 
 WORLDS, STEPS = 16, 6
 UPDATE = WORLDS * STEPS
@@ -173,26 +173,6 @@ def test_a_rollout_in_the_place_of_another_has_its_own_graphs() -> None:
     assert differing(*ends) == []
 
 
-class Echo(ProcessGroup):
-    """A group of two with one process: the other has the same numbers."""
-
-    def __init__(self) -> None:
-        super().__init__(0, 2)
-        self.messages: list[int] = []
-
-    def all_reduce_mean_later(self, tensors: Any) -> Callable[[], None]:
-        self.messages.append(sum(tensor.numel() for tensor in tensors))
-        return lambda: None
-
-    def all_reduce_sum_(self, tensor: Tensor) -> Tensor:
-        return tensor
-
-    def broadcast_(self, tensors: Any) -> None: ...
-
-    def gather(self, value: Any) -> list[Any]:
-        return [value]
-
-
 def test_a_group_exchanges_one_buffer_between_two_graphs() -> None:
     """Several GPUs: forward and backward, the exchange, clip and Adam. Here with one process and its echo."""
     config = small_config("algo.observation_norm=false", "predictor.enabled=false")
@@ -207,6 +187,17 @@ def test_a_group_exchanges_one_buffer_between_two_graphs() -> None:
     weights = sum(parameter.numel() for parameter in trainer.agent.parameters())
     messages = [size for size in echo.messages if size > 100]
     assert messages == [weights + 1] * (4 * config.algo.epochs * config.algo.minibatches)
+
+
+def test_a_group_of_one_over_gloo_goes_the_way_of_two() -> None:
+    """What tests/gpu does over NCCL: real messages between the graphs, with the numbers of the echo."""
+    config, echo = small_config(), Echo()
+    expected = state_of(updated(trainer_of(config, Graphs.DRY, echo), 5).checkpoint())
+    with connected(torch.device("cpu")) as group:
+        found = state_of(updated(trainer_of(config, Graphs.DRY, group), 5).checkpoint())
+    assert differing(expected, found) == []
+    assert group.messages == echo.messages
+    assert len(group.messages) > 5 * config.algo.epochs * config.algo.minibatches
 
 
 def test_the_fit_of_a_group_is_several_graphs() -> None:
@@ -279,7 +270,7 @@ def test_a_learning_rate_that_is_lost_in_a_resume_is_seen(monkeypatch: pytest.Mo
 
 TRAINED = (
     "device=cpu", "engine.graph=dry", "num_worlds=32", "minutes=0", "progress=false", "tensorboard=false",
-    "algo.actor_hidden=[32]", "algo.critic_hidden=[32]", "predictor.batches_per_update=8",
+    "algo.actor_hidden=[32]", "algo.critic_hidden=[32]", "algo.autocast=mixed", "predictor.batches_per_update=8",
     *IN_SAMPLES,
 )  # fmt: skip
 CHANGES = (  # 128 control steps an update, 192 later
@@ -320,3 +311,4 @@ def test_the_command_resumes_exactly(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert train(monkeypatch, *TRAINED, f"out={parts}", "samples=512") == 0
     assert train(monkeypatch, f"resume={parts}", "samples=1024", "progress=false") == 0
     assert differing(state_of(load_checkpoint(whole)), state_of(load_checkpoint(parts))) == []
+    assert train(monkeypatch, f"resume={parts}", "samples=1152", "progress=false", "engine.graph=auto") == 0

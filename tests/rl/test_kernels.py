@@ -81,6 +81,21 @@ def test_a_stage_with_another_robot_brings_its_kernels() -> None:
     assert {each.module.name for each in plain} < {each.module.name for each in both}
 
 
+def test_a_stage_of_pauses_and_of_motion_capture_brings_their_kernels() -> None:
+    stages = "{share: 0.3, task: ['serve.pause=[0.0,1.0]']}, {share: 0.5, task: ['sensing=mocap']}"
+    plain, both = (
+        {each.module.name for each in kernels_of(load_train_config(["engine=native", *given]), CPU)}
+        for given in ([], [f"curriculum=[{stages}]"])
+    )
+    assert both - plain == {"pace.task.pauses", "pace.sim.mocap"}
+
+
+def test_all_stages_of_the_generalist_are_rehearsed() -> None:
+    """The last one has a machine's serves, which are sampled until they land: nothing lands in a rehearsal."""
+    names = {each.module.name for each in kernels_of_a_gpu(load_train_config(["experiment=generalist"]))}
+    assert {"pace.task.pauses", "pace.sim.mocap"} <= names
+
+
 def test_an_architecture_is_one_of_warps() -> None:
     if not context.runtime.nvrtc_supported_archs:
         pytest.skip("Warp has no CUDA compiler here")

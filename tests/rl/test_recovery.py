@@ -160,7 +160,7 @@ def test_the_last_words_of_a_run_on_a_full_disk_are_its_fault(tmp_path: Path, mo
 def test_a_full_memory_of_the_gpu_is_one_line_and_nothing_is_lost(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, first_bad: int
 ) -> None:
-    monkeypatch.setattr("torch.cuda.mem_get_info", lambda: (2**30, 24 * 2**30))
+    monkeypatch.setattr("torch.cuda.mem_get_info", lambda _: (2**30, 24 * 2**30))
     trainer = dummy_trainer(tmp_path, 20)
     update, before = trainer.update, {}
 

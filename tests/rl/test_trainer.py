@@ -204,7 +204,11 @@ def test_rows_after_the_checkpoint_are_replaced_by_a_resume(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_ends_the_run_with_a_checkpoint(tmp_path: Path, number: signal.Signals) -> None:
+def test_a_signal_ends_the_run_with_a_checkpoint(
+    tmp_path: Path, number: signal.Signals, request: pytest.FixtureRequest
+) -> None:
+    ignored = signal.signal(number, signal.default_int_handler)  # under nohup a lost terminal is, and stays so
+    request.addfinalizer(lambda: signal.signal(number, ignored))
     trainer = make_trainer(tmp_path, updates=1000)
     advance = trainer.env.advance
     calls = 0

@@ -104,7 +104,7 @@ def test_two_policies_play_the_same_serves(tmp_path: Path, capsys: pytest.Captur
         (("pretrained/pace", "pretrained/pace"), 2, "is given twice"),
         (("pretrained/pace", "window=1e12"), 2, "nothing to compare"),
         (("pretrained/pace", "pretrained/wide", "rows=[lob]"), 2, "serve/lob does not exist"),
-        (("pretrained/pace", "window=-1"), 2, "window must be positive"),
+        (("pretrained/pace", "window=-1"), 2, "window must be above 0"),
         (("pretrained/pace", "figure=a.pdf"), 2, "must end in .png"),
     ],
 )

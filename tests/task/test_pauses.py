@@ -168,7 +168,7 @@ def test_the_state_of_an_older_version_has_no_pauses() -> None:
     state = env.state_dict()
     new = [name for name in state if name.startswith(("game.pause.", "serves.")) or name == "worlds.in_view"]
     old = {name: value for name, value in state.items() if name not in new}
-    assert len(new) == 6
+    assert len(new) == 8
     old["sensing._line"] = old["sensing._line"][..., :8]  # as it was, for its own upgrade
     old["statistics.sums"] = old["statistics.sums"][:-3]
     other.load_state_dict(upgrade_state({"processes": [{"env": old}]}, 2)["processes"][0]["env"])
