@@ -226,6 +226,7 @@ COMMANDS = {
             "seed",
             "samples",
             "minutes",
+            "checkpoint_minutes",
             "out",
             "tensorboard",
             "progress",

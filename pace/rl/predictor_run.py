@@ -64,10 +64,12 @@ class PredictorRun:
 
     def train(self, run: RunFolder) -> dict[str, float]:
         """Fit rollout after rollout, to the end or to the first Ctrl-C or SIGTERM; each is measured before its fit.
-        Returns updates, samples and seconds."""
+
+        Writes a checkpoint every ``checkpoint_minutes``. Returns updates, samples and seconds.
+        """
         config, per_update = self.config, self.config.num_worlds * self.config.algo.steps
         progress = Progress(config.progress, config.samples, 60.0 * config.minutes, shown=["predictor_rmse_cm"])
-        started = last = time.monotonic()
+        started = last = saved_at = time.monotonic()
         update, limit = 0, 60.0 * config.minutes if config.minutes > 0 else math.inf
         with self.stop.listening():
             while (done := max(update * per_update / config.samples, (last - started) / limit)) < 1:
@@ -82,8 +84,15 @@ class PredictorRun:
                 last = now
                 run.log(row)
                 progress.show(row)
+                if now - saved_at >= 60.0 * config.checkpoint_minutes:
+                    run.save(update, self.checkpoint(_counters(row)))
+                    saved_at = now
         progress.close()
         return {"updates": update, "samples": update * per_update, "wall_s": last - started}
+
+    def checkpoint(self, counters: dict[str, float]) -> Checkpoint:
+        """The network, after ``counters`` of its training."""
+        return Checkpoint(to_dict(self.config), counters, {"predictor": self.network.state_dict()}, None)
 
     def measure(self) -> dict[str, float]:
         """RMSE in cm, root of the mean square over rollouts that are not fitted, without NaN bins."""
@@ -93,6 +102,10 @@ class PredictorRun:
             for name, value in self.trainer.errors().items():
                 squares.setdefault(name, []).extend([value**2] if value == value else [])
         return {name: (sum(values) / len(values)) ** 0.5 for name, values in squares.items() if values}
+
+
+def _counters(row: dict[str, float]) -> dict[str, float]:
+    return {"updates": row["update"], "samples": row["samples"], "wall_s": row["wall_s"]}
 
 
 def train_predictor(composed: DictConfig) -> None:
@@ -113,9 +126,8 @@ def _train(config: TrainConfig, run: RunFolder) -> None:
     run.configure(to_dict(config))
     print(f"training the predictor on serves in {config.num_worlds} worlds, run folder {run.path}", flush=True)
     counters = session.train(run)
+    folder = run.save(int(counters["updates"]), session.checkpoint(counters), last=True)  # measuring may be interrupted
     errors = session.measure()
-    weights = {"predictor": session.network.state_dict()}
-    folder = run.save(int(counters["updates"]), Checkpoint(to_dict(config), counters, weights, None), last=True)
     run.close()
     result = {"errors": errors, "counters": counters, "ball": config.ball.name, "serve": config.serve.name}
     write_whole(run.path / RESULT, json.dumps(result, indent=1))

@@ -16,7 +16,9 @@ from pace.config.training import TrainConfig
 from pace.predictor.__main__ import main
 from pace.predictor.regression import PredictorTrainer
 from pace.rl.practice import ServePractice
+from pace.rl.predictor_run import PredictorRun
 from pace.runs.checkpoint import load_checkpoint
+from pace.runs.checkpoint_folders import list_checkpoints
 
 
 def practice_config(*overrides: str) -> TrainConfig:
@@ -64,6 +66,30 @@ def test_the_learning_rate_falls_and_a_stop_keeps_what_was_learned(
     assert main() == 0
     assert load_checkpoint(tmp_path).counters["updates"] == 3
     assert rates == pytest.approx([0.004, 0.00342, 0.00202], rel=0.01)
+
+
+def test_what_was_learned_is_saved_in_between_and_before_it_is_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    saved: list[list[str]] = []
+    fit = PredictorTrainer.update
+
+    def update(trainer: PredictorTrainer) -> dict[str, float]:
+        saved.append([folder.name for folder in list_checkpoints(tmp_path)])
+        return fit(trainer)
+
+    def terminated(_: PredictorRun) -> dict[str, float]:
+        os.kill(os.getpid(), signal.SIGTERM)
+        raise AssertionError("SIGTERM has ended the command")
+
+    monkeypatch.setattr(PredictorTrainer, "update", update)
+    monkeypatch.setattr(PredictorRun, "measure", terminated)
+    overrides = ["num_worlds=64", "minutes=0", "checkpoint_minutes=0", "progress=false", "algo.steps=4"]
+    overrides += ["samples=768", "predictor.batches_per_update=2"]
+    monkeypatch.setattr(sys, "argv", ["train", f"out={tmp_path}", *overrides])
+    assert main() == 75
+    assert saved == [[], ["update_00000001"], ["update_00000001", "update_00000002"]]
+    assert load_checkpoint(tmp_path).counters["updates"] == 3
 
 
 @pytest.mark.slow
