@@ -20,7 +20,7 @@ __version__ = "0.1.0"
 __all__ = ["load_policy", "make_env"]
 sys.meta_path.append(MovedCommands())
 # OpenMP reads it when torch is loaded. Its threads would spin while they wait for one another, and take the cores from
-# whoever shares them: a run of one process beside two other programs does 6 times as many steps with threads that sleep.
+# whoever shares them, a run's own too: beside other programs, one process does five times the steps if they sleep.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 __getattr__ = on_first_use(__name__, {"load_policy": "pace.rl.policies", "make_env": "pace.task.env"})
