@@ -1,7 +1,7 @@
 """A folder that is replaced as a whole: by one that is complete, or not at all, whenever the process is killed.
 
-The new folder is made in a hidden one beside it. A lock in that tells whether the process that made it still lives; what
-a dead one has left, the next replacement in the same place finishes or undoes.
+The new folder is made in a hidden one beside it. A lock in that tells whether the process that made it still lives;
+what a dead one has left, the next replacement in the same place finishes or undoes.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ def replaced(folder: Path) -> Iterator[Path]:
 
 
 def clear_leftovers(parent: Path) -> None:
-    """Remove what killed processes have left of :func:`replaced` in ``parent``; a folder that had no name at that moment
-    gets it back."""
+    """Remove what killed processes have left of :func:`replaced` in ``parent``. A folder that was to be replaced, and
+    was not yet, gets its name back."""
     for scratch in sorted(parent.glob(f"{PREFIX}*")) if parent.is_dir() else ():
         with suppress(Timeout, OSError, NotImplementedError):  # in use, or of somebody else
             if _is_own(scratch):
