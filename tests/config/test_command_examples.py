@@ -13,7 +13,7 @@ from pace.config.base import ConfigError, compose, parse
 from pace.config.limits import first_outside
 from tests.config.test_examples import places, put
 from tests.config.test_limits import leaves
-from tests.helpers.examples import assert_one_line, check, counts, st, wrong_values
+from tests.helpers.examples import assert_one_line, check, counts_of, st, wrong_values
 
 COMMANDS = {
     "evaluate": (commands.EvaluateConfig, ["run=any", "num_worlds=4"]),
@@ -33,7 +33,7 @@ def plain(command: str) -> tuple[type, dict[str, Any]]:
     return schema, given  # type: ignore[return-value]
 
 
-@counts
+@counts_of(60, 200)
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_command_with_wrong_values_is_valid_or_one_line(command: str, count: int) -> None:
     schema, given = plain(command)
