@@ -12,7 +12,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from hydra import compose, initialize_config_dir
 
+from pace.config.base import config_dir
 from pace.runs.checkpoint import load_checkpoint
 from tests.helpers.outside import SMALL, python
 from tests.helpers.training import assert_same, rows_of
@@ -80,6 +82,16 @@ def test_the_script_needs_a_run_folder_and_tells_failures(slurm: dict[str, str],
     assert not (tmp_path / "called").exists()
 
 
+def test_the_launcher_for_slurm_composes() -> None:
+    if importlib.util.find_spec("hydra_plugins.hydra_submitit_launcher") is None:
+        pytest.skip("needs hydra-submitit-launcher")
+    with initialize_config_dir(config_dir=str(config_dir()), version_base="1.3"):
+        found = compose("train", ["hydra/launcher=slurm", "hydra.launcher.account=me"], return_hydra_config=True)
+    launcher = found.hydra.launcher
+    assert launcher["_target_"].endswith("SlurmLauncher")
+    assert (launcher.account, launcher.timeout_min, launcher.max_num_timeout) == ("me", 720, 0)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
 def test_a_launcher_runs_jobs_at_once_and_tells_that_one_failed(tmp_path: Path, launcher: str) -> None:
@@ -100,6 +112,46 @@ def test_a_launcher_runs_jobs_at_once_and_tells_that_one_failed(tmp_path: Path, 
     if launcher == "joblib":
         assert again.stderr.count("resume=seed") == 2
     assert "Traceback" not in again.stderr
+
+
+#: Stand-ins for Slurm's programs: a job of an array is a process of this machine.
+SBATCH = """#!/bin/bash
+cp "${@: -1}" "$HERE/submitted"
+for task in $(seq 0 $(sed -n 's/^#SBATCH --array=0-\\([0-9]*\\)%.*/\\1/p' "${@: -1}")); do
+  SLURM_JOB_ID=77 SLURM_ARRAY_JOB_ID=77 SLURM_ARRAY_TASK_ID=$task SLURM_PROCID=0 SLURM_LOCALID=0 SLURM_NODEID=0 \\
+    SLURM_NTASKS=1 SLURM_JOB_NUM_NODES=1 SLURM_JOB_NODELIST=here bash "${@: -1}" > /dev/null 2>&1 &
+done
+echo "Submitted batch job 77"
+"""
+SRUN = """#!/bin/bash
+while [[ $1 == -* ]]; do if [[ $1 == --output || $1 == --error ]]; then shift 2; else shift; fi; done
+exec "$@"
+"""
+SACCT = """#!/bin/bash
+echo "JobID|State|NodeList"
+for task in 0 1; do echo "77_$task|RUNNING|here"; done
+"""
+
+
+@pytest.mark.long
+def test_a_sweep_is_an_array_of_slurm_whose_jobs_get_a_signal_before_their_time_ends(tmp_path: Path) -> None:
+    if importlib.util.find_spec("hydra_plugins.hydra_submitit_launcher") is None:
+        pytest.skip("needs hydra-submitit-launcher")
+    programs = tmp_path / "bin"
+    programs.mkdir()
+    for name, text in (("sbatch", SBATCH), ("srun", SRUN), ("sacct", SACCT)):
+        (programs / name).write_text(text)
+        (programs / name).chmod(0o755)
+    job = environment(PATH=f"{programs}:{os.environ['PATH']}", HERE=str(tmp_path))
+    line = [sys.executable, "-m", "pace.rl.train", "-m", "hydra/launcher=slurm", "hydra.launcher.partition=gpu"]
+    line += ["seed=1,2", "out=seed${seed}", "hydra.sweep.dir=jobs", *SMALL, *LIMITS]
+    done = subprocess.run(line, cwd=tmp_path, env=job, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert [load_checkpoint(tmp_path / f"seed{seed}").config["seed"] for seed in (1, 2)] == [1, 2]
+    asked = (tmp_path / "submitted").read_text()
+    for option in ("array=0-1%2", "signal=TERM@180", "time=720", "partition=gpu", "mem=64GB", "cpus-per-task=16"):
+        assert f"#SBATCH --{option}\n" in asked, asked
+    assert "#SBATCH --gpus-per-node=1\n" in asked
 
 
 @pytest.fixture

@@ -13,6 +13,7 @@ import pytest
 from pace import cores
 from pace.cores import core_set, quota, threads_of, usable_cores
 from pace.runs.queue import shares_of_cores
+from tests.helpers.control_groups import control_group
 
 V1 = "36 25 0:31 {root} {mount} rw,nosuid - cgroup cgroup rw,cpu,cpuacct\n"
 V2 = "29 23 0:26 {root} {mount} rw,nosuid - cgroup2 cgroup2 rw\n"
@@ -73,41 +74,31 @@ def test_a_queue_shares_as_many_cores_as_are_granted(monkeypatch: pytest.MonkeyP
     assert sorted(first + second) == [0, 1, 6, 7]
 
 
-GROUPS = Path("/sys/fs/cgroup")
-
-
-def enter(group: Path, **values: str) -> Path:
-    """Make a control group of this machine."""
-    try:
-        group.mkdir()
-        for name, value in values.items():
-            (group / name.replace("_", ".", 1)).write_text(value)
-    except OSError:
-        pytest.skip("this machine lets no test make control groups")
-    return group
+#: One core, or the time of one: version, controller, and what is written into the group.
+LIMITED = {
+    "quota of version 1": (1, "cpu", {"cpu.cfs_period_us": "100000", "cpu.cfs_quota_us": "100000"}),
+    "quota of version 2": (2, "cpu", {"cpu.max": "100000 100000"}),
+    "cpuset of version 1": (1, "cpuset", {"cpuset.mems": "0", "cpuset.cpus": str(max(core_set(), default=0))}),
+    "cpuset of version 2": (2, "cpuset", {"cpuset.cpus": str(max(core_set(), default=0))}),
+}
 
 
 @pytest.fixture
 def one_core(request: pytest.FixtureRequest) -> Iterator[Path]:
     """A control group of this machine: with the time of one core, or with one core."""
-    folder = GROUPS / request.param / f"pace_test_{os.getpid()}"
-    if request.param == "cpu":
-        group = enter(folder, cpu_cfs_period_us="100000", cpu_cfs_quota_us="100000")
-    else:
-        group = enter(folder, cpuset_mems="0", cpuset_cpus=str(core_set()[-1]))
-    yield group
-    group.rmdir()
+    with control_group(*LIMITED[request.param]) as group:
+        yield group
 
 
 @pytest.mark.skipif(len(core_set()) < 2, reason="needs two cores")
-@pytest.mark.parametrize("one_core", ["cpu", "cpuset"], indirect=True)
+@pytest.mark.parametrize("one_core", LIMITED, indirect=True)
 def test_a_process_in_a_group_with_one_core_sees_it_before_torch_is_loaded(one_core: Path) -> None:
     code = (
         "import sys; from pace.command.run import _limit_threads; _limit_threads(); assert 'torch' not in sys.modules;"
         "import torch; from pace.distributed import suitable_size; from pace.cores import usable_cores;"
         "print(usable_cores(), torch.get_num_threads(), suitable_size(1024, torch.device('cpu')))"
     )
-    enter = f'echo $$ > {one_core}/tasks; exec {sys.executable} -c "{code}"'
+    enter = f'echo $$ > {one_core}/cgroup.procs; exec {sys.executable} -c "{code}"'
     environment = {key: value for key, value in os.environ.items() if key != "OMP_NUM_THREADS"}
     done = subprocess.run(["sh", "-c", enter], env=environment, capture_output=True, text=True, check=False)
     assert done.stdout.split() == ["1", "1", "1"], done.stderr

@@ -17,6 +17,7 @@ from pace.config.base import ConfigError
 from pace.distributed import suitable_size
 from pace.memory import GIB, available_memory
 from pace.runs.checkpoint import load_checkpoint
+from tests.helpers.control_groups import control_group
 from tests.helpers.outside import SMALL
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -92,24 +93,19 @@ def test_no_more_processes_than_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     assert suitable_size(4096, torch.device("cpu")) == 16
 
 
-@pytest.fixture
-def two_gib() -> Iterator[Path]:
+@pytest.fixture(params=[(1, "memory.limit_in_bytes"), (2, "memory.max")], ids=["version 1", "version 2"])
+def two_gib(request: pytest.FixtureRequest) -> Iterator[Path]:
     """A control group of this machine with 2 GiB."""
-    folder = Path("/sys/fs/cgroup/memory") / f"pace_test_{os.getpid()}"
-    try:
-        folder.mkdir()
-        (folder / "memory.limit_in_bytes").write_text(str(2 * GIB))
-    except OSError:
-        pytest.skip("this machine lets no test make control groups")
-    yield folder
-    folder.rmdir()
+    version, limit = request.param
+    with control_group(version, "memory", {limit: str(2 * GIB)}) as folder:
+        yield folder
 
 
 @pytest.mark.long
 def test_a_run_in_2_gib_says_what_fits_and_fits(two_gib: Path, tmp_path: Path) -> None:
     def train(*arguments: str) -> subprocess.CompletedProcess[str]:
         program = [sys.executable, "-m", "pace.rl.train", *arguments]
-        line = ["sh", "-c", f'echo $$ > {two_gib}/tasks; exec "$@"', "sh", *program]
+        line = ["sh", "-c", f'echo $$ > {two_gib}/cgroup.procs; exec "$@"', "sh", *program]
         environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
         return subprocess.run(line, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False)
 

@@ -130,8 +130,10 @@ def _run_hydra(command: Command) -> int:
     return status
 
 
-def _full_memory(error: RuntimeError) -> str:
-    """The line for a GPU whose memory is full. Errors: ``error`` itself if it is another one."""
+def _full_memory(error: RuntimeError | MemoryError) -> str:
+    """The line for a memory that is full, of a GPU or of the machine. Errors: ``error`` itself if it is another one."""
+    if isinstance(error, MemoryError) or "DefaultCPUAllocator: can't allocate memory" in str(error):
+        return "the memory of this machine is full: ask for less at once, such as fewer worlds, serves or pixels"
     from pace.devices import full_memory_in_words, out_of_memory  # imports torch, as the work has done
 
     if not out_of_memory(error):
@@ -160,7 +162,7 @@ def _work(command: Command, config: DictConfig) -> int:
         return complain(str(error), EXIT_FAILED)
     except OSError as error:
         return _of_disk(error)
-    except RuntimeError as error:
+    except (RuntimeError, MemoryError) as error:
         return complain(_full_memory(error), EXIT_FAILED)
     return 0
 

@@ -7,12 +7,15 @@ here declare the keys and their types; an unknown key, a wrong type or a value o
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
+from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from types import UnionType
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigKeyError, OmegaConfBaseException
@@ -101,12 +104,15 @@ def parse(config: DictConfig | dict[str, Any], schema: type[T]) -> T:
         plain = config if isinstance(config, DictConfig) else OmegaConf.create(config)
         OmegaConf.resolve(plain)
         plain = schema.complete(plain) if issubclass(schema, Completed) else plain
+        nested = next(_nested(schema, OmegaConf.to_container(plain), ""), None)
+        require(nested is None, f"{nested} must be one value, not a list or a table")
         merged = OmegaConf.merge(OmegaConf.structured(schema), plain)
         parsed = OmegaConf.to_object(merged)
     except OmegaConfBaseException as error:
         raise ConfigError(f"configuration key '{error.full_key or '?'}': {_reason(error)}") from error
     except OverflowError as error:  # a whole number that no float can hold
-        raise ConfigError(f"configuration key '{getattr(error, 'full_key', '?')}': {error}") from error
+        key = next(_too_large(OmegaConf.to_container(plain)), "?")  # which the error does not tell
+        raise ConfigError(f"configuration key '{key}': the number is too large") from error
     wrong = first_outside(parsed)
     if wrong is not None:
         raise ConfigError(wrong)
@@ -119,6 +125,36 @@ def _reason(error: OmegaConfBaseException) -> str:
     if isinstance(error, ConfigKeyError) and is_dataclass(error.object_type):
         return text + meant(str(error.key), [field.name for field in fields(error.object_type)])
     return "needs a list, such as [1.0, 2.0]" if "is not a ListConfig" in text else text
+
+
+@cache
+def _hints(schema: type) -> dict[str, Any]:
+    return get_type_hints(schema)
+
+
+def _nested(hint: Any, value: Any, place: str) -> Iterator[str]:
+    """Places of lists and tables where a list or a table has single values, which OmegaConf lets pass."""
+    parts = get_args(hint)
+    if is_dataclass(hint) and isinstance(value, dict):
+        for key, inner in _hints(hint).items():  # type: ignore[arg-type]
+            yield from _nested(inner, value.get(key), f"{place}.{key}" if place else key)
+    elif get_origin(hint) is UnionType:  # or null
+        yield from _nested(parts[0], value, place)
+    elif get_origin(hint) in (list, dict) and isinstance(value, list | dict):
+        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+            where = f"{place}.{key}" if isinstance(value, dict) else f"{place}[{key}]"
+            if parts[-1] in (int, float, str, bool) and isinstance(item, list | dict):
+                yield where
+            yield from _nested(parts[-1], item, where)
+
+
+def _too_large(value: Any, place: str = "") -> Iterator[str]:
+    """Keys of the whole numbers that no float can hold."""
+    if isinstance(value, dict | list):
+        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from _too_large(item, f"{place}.{key}" if place else str(key))
+    elif isinstance(value, int) and abs(value) > sys.float_info.max:
+        yield place
 
 
 def meant(word: str, known: Iterable[str]) -> str:

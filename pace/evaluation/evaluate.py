@@ -22,6 +22,7 @@ from pace.evaluation.first_ball import first_ball_row
 from pace.evaluation.quality import QualityRecorder
 from pace.evaluation.report import FILES as REPORT
 from pace.evaluation.report import describe, tables, write_report
+from pace.evaluation.room import require_room
 from pace.evaluation.serves import MakeRecorder, Row, evaluate_row
 from pace.evaluation.sweep import FILES as SWEEP
 from pace.evaluation.sweep import (
@@ -56,6 +57,7 @@ def evaluate_from_config(composed: DictConfig) -> None:
     told = task_line(config.task, saved.config, task)
     print(f"policy {policy.source}\n{told}\n{describe(context)}", flush=True)
     cells = plan(config, policy, task, overrides, context["versions"])
+    require_rooms(config, cells)
     folder = make_out(config.out, "evaluation", files_of(config))
     finished = finished_cells(folder, cells) if cells else {}
     if config.rows:
@@ -68,6 +70,18 @@ def evaluate_from_config(composed: DictConfig) -> None:
 def files_of(config: EvaluateConfig) -> list[str]:
     """Names of the files that an evaluation writes."""
     return [*((*REPORT, *FIGURES) if config.rows else ()), *(SWEEP if config.sweep else ())]
+
+
+def require_rooms(config: EvaluateConfig, cells: Sequence[Cell]) -> None:
+    """Errors: :class:`ConfigError` if a table, which keeps the records of all rows, or a cell does not fit."""
+    device, worlds = resolve_device(config.device), config.worlds_for(config.serves)
+    played = max(config.serves, worlds) + config.warmup_serves * worlds
+    if config.rows:
+        require_room(played * len(config.rows), worlds, device)
+    if config.first_ball and (config.rows or cells):
+        require_room(config.first_ball_worlds, config.first_ball_worlds, device)
+    for cell in cells:
+        require_room(cell.serves + config.warmup_serves * cell.worlds, cell.worlds, resolve_device(cell.device))
 
 
 def plan(

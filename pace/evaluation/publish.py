@@ -8,9 +8,7 @@ evaluation and of a sweep, and a model card (README.md).
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import tempfile
 from pathlib import Path
 
 from omegaconf import DictConfig
@@ -26,6 +24,7 @@ from pace.runs.metrics import write_slim
 from pace.runs.own_files import LIST, listed, note
 from pace.runs.own_files import require_own as require_own_files
 from pace.runs.run_folder import METRICS
+from pace.runs.whole_folder import clear_leftovers, replaced
 
 RUN_FILES = ("learning_curve.png", "versions.json")
 EVALUATION_FILES = ("evaluation.json", "evaluation.md", "evaluation.csv")
@@ -58,40 +57,21 @@ def keep(run: Path, folder: Path, evaluation: Path | None = None, notes: str = "
     """Publish ``run`` and its ``evaluation`` as ``folder``, with ``notes`` in the card; returns the files written.
 
     The folder appears when it is complete. An existing published policy is replaced; files in it that this function
-    did not write stay.
+    did not write stay. What a kill has left of an earlier call beside ``folder`` is finished or undone.
 
     Errors: :class:`CheckpointError` for a ``run`` without a checkpoint, or an ``evaluation`` folder without results;
     :class:`KeepError` for a folder that holds anything else, or the run.
     """
+    clear_leftovers(folder.parent)
     checkpoint = find_checkpoint(run)
     if evaluation is not None and not (evaluation / "evaluation.json").is_file():
         raise CheckpointError(f"{evaluation} holds no evaluation.json: give a folder that pace evaluate wrote")
     require_own(folder, run, checkpoint)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".keep_") as scratch:
-        fresh = Path(scratch) / folder.resolve().name  # the card is headed by this name
+    with replaced(folder) as fresh:  # the card is headed by its name
         written = write_policy(fresh, checkpoint, evaluation, notes)
         if folder.is_dir():
             copy_others(folder, fresh)
-        replace_folder(folder, fresh)
     return [folder / name for name in written]
-
-
-def replace_folder(folder: Path, fresh: Path) -> None:
-    """Give ``fresh`` the name ``folder``; what was there is put back if that fails or is interrupted.
-
-    Until then it has a hidden name beside ``folder``, where a kill leaves it.
-    """
-    old = folder.with_name(f".{folder.resolve().name}.{os.getpid()}.old")
-    try:
-        if folder.exists():
-            folder.rename(old)
-        fresh.rename(folder)
-    except BaseException:  # Ctrl-C, too
-        if old.exists() and not folder.exists():
-            old.rename(folder)
-        raise
-    shutil.rmtree(old, ignore_errors=True)
 
 
 def require_own(folder: Path, run: Path, checkpoint: Path) -> None:

@@ -33,6 +33,7 @@ class PPOLoss(ClipPPOLoss):
             loss_critic_type="l2",
             clip_value=clip_value,
             functional=False,
+            log_explained_variance=False,  # of a minibatch: the learner has that of all samples
         )
         if clip_value is not None:  # TorchRL asks whether it is zero, which of its buffer the host would have to read
             del self.clip_value

@@ -29,14 +29,7 @@ from pace.runs.checkpoint import load_weights
 from pace.runs.optimiser import adam, learning_rate, live_state, load_optimiser_state, optimiser_state
 from pace.runs.reading import read
 
-LOSS_METRICS = (
-    "loss_objective",
-    "loss_critic",
-    "entropy",
-    "clip_fraction",
-    "value_clip_fraction",
-    "explained_variance",
-)
+LOSS_METRICS = ("loss_objective", "loss_critic", "entropy", "clip_fraction", "value_clip_fraction")
 METRICS = ("kl", "grad_norm_actor", "grad_norm_critic", *LOSS_METRICS)
 
 
@@ -78,6 +71,7 @@ class PPO:
         """
         self.loss.get_buffer("entropy_coeff").fill_(scheduled(self.config.entropy, at))
         self.schedule.target.fill_(scheduled(self.config.kl_target, at))
+        explained = rollout.explained_variance(self.group)
         sources = self._sources(rollout)
         batch, step = self._minibatch(rollout)
         rows, count = batch.batch_size[0], self.config.minibatches
@@ -90,7 +84,7 @@ class PPO:
         self.agent.actor.bound_std(self.config.std_floor, scheduled(self.config.std, at))
         self._mean.div_(self.config.epochs * count)
         self.group.all_reduce_mean_([self._mean])
-        metrics = dict(zip(METRICS, self._mean.unbind(), strict=True))
+        metrics = dict(zip(METRICS, self._mean.unbind(), strict=True)) | {"explained_variance": explained}
         return metrics | {"lr": learning_rate(self.actor_optimiser), "policy_std": self.agent.actor.std.mean()}
 
     def _make_minibatch(self, rollout: Rollout) -> tuple[TensorDict, Callable[[], None]]:

@@ -17,6 +17,7 @@ from torch import Tensor
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from pace.arrays.graph import Graphs
+from pace.distributed import ProcessGroup
 from pace.predictor.regression import PredictorSource
 from pace.rl.agent import Agent
 from pace.sim.replay import WorldReplay
@@ -162,6 +163,16 @@ class Rollout:
         )
         self.advantage.copy_(advantage)
         self.value_target.copy_(target)
+
+    @torch.no_grad()
+    def explained_variance(self, group: ProcessGroup) -> Tensor:
+        """Share of the variance of the value targets of all processes that the stored values explain, (); at most 1."""
+        both = torch.stack([self.value_target, self.value_target - self.value[: self.steps]]).flatten(1)
+        mean = both.mean(1, keepdim=True)
+        group.all_reduce_mean_([mean])
+        variance = (both - mean).square().mean(1)
+        group.all_reduce_mean_([variance])
+        return 1.0 - variance[1] / (variance[0] + torch.finfo(variance.dtype).eps)
 
     def healthy(self) -> Tensor:
         """Whether there is no :meth:`fault`, ()."""

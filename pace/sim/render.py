@@ -90,6 +90,8 @@ class SceneRenderer:
             self._gl.make_current()
             self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
+            if "framebuffer is not complete" in str(error):
+                raise RenderError(f"OpenGL draws no picture of {width} x {height} pixels: give less") from error
             raise RenderError(f"{NO_GL} ({str(error).splitlines()[0]})") from error
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
 

@@ -19,6 +19,7 @@ from pace.devices import resolve_device
 from pace.evaluation.bar import serve_bar
 from pace.evaluation.paired import Paired, compare_records, play_listed
 from pace.evaluation.report import write_json
+from pace.evaluation.room import require_room
 from pace.evaluation.task import own_pauses, policy_on, task_line
 from pace.evaluation.text import Table, markdown_table, number, text_table
 from pace.rl.policies import TaskPolicy, load_policy
@@ -56,6 +57,9 @@ def compare_from_config(composed: DictConfig) -> None:
     curves = {name: seeds for name, seeds in curves.items() if any(len(seed.samples) for seed in seeds)}
     what = f"metrics of {config.window:g} control steps or more (window=)"
     require(bool(curves or policies), f"nothing to compare: no run has {what}, and two policies are played, no others")
+    if policies:
+        played = max(config.serves, config.worlds) + config.warmup_serves * config.worlds
+        require_room(2 * played, config.worlds, resolve_device(config.device))
     out = make_out(config.out, "comparison", [PAGE, DATA, *([config.figure] if curves else [])])
     sections, files = [], []
     content: dict[str, Any] = {"runs": config.runs, "versions": versions()}

@@ -10,6 +10,7 @@ from io import StringIO
 from typing import Any
 
 from pace.viewer.gate import Gate
+from pace.viewer.messages import listen_to_controls
 
 LOCAL = "127.0.0.1"
 
@@ -75,7 +76,9 @@ def _viser(host: str, port: int) -> Any:
     import viser
 
     with redirect_stdout(StringIO()):  # hides its banner
-        return viser.ViserServer(host=host, port=port, label="PACE", verbose=False)
+        server = viser.ViserServer(host=host, port=port, label="PACE", verbose=False)
+    listen_to_controls(server)
+    return server
 
 
 def number(slider: Any, start: float) -> float:

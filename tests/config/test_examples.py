@@ -18,7 +18,7 @@ from pace.config.predictor import PredictorConfig
 from pace.config.sim import BallConfig, EngineConfig, RandomizationConfig, RobotConfig, SensingConfig
 from pace.config.task import ObservationConfig, ResetConfig, RewardConfig, ServeConfig
 from pace.config.training import AlgoConfig, TrainConfig, load_train_config
-from tests.helpers.examples import assert_one_line, check, counts, st, wrong_values
+from tests.helpers.examples import assert_one_line, check, counts, counts_of, st, wrong_values
 
 PARTS = {
     "robot": RobotConfig, "ball": BallConfig, "engine": EngineConfig, "serve": ServeConfig, "sensing": SensingConfig,
@@ -44,7 +44,7 @@ def put(tree: Any, place: tuple[Any, ...], value: Any) -> Any:
     return changed
 
 
-@counts
+@counts_of(60)
 @pytest.mark.parametrize("part", PARTS)
 def test_a_part_with_wrong_values_is_valid_or_one_line(part: str, count: int) -> None:
     known = sorted(places(CONFIG[part]), key=str)
@@ -95,7 +95,7 @@ def arguments() -> Any:
     return st.lists(st.one_of(st.tuples(key, value).map("=".join), value), max_size=3)
 
 
-@counts
+@counts_of(25)
 def test_arguments_are_prepared_or_one_line(count: int) -> None:
     @check(10 * count, arguments())
     def example(given: list[str]) -> None:

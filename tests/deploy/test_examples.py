@@ -13,7 +13,7 @@ import pytest
 from pace.config.base import compose, parse
 from pace.config.commands import ExportConfig
 from pace.deploy.export import export_policy
-from tests.helpers.examples import assert_one_line, check, counts, st
+from tests.helpers.examples import assert_one_line, check, counts_of, st
 from tests.helpers.saved import remembering_policy
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "deploy_sim2sim.py"
@@ -70,7 +70,7 @@ def within_range(controller: Any, target: Any) -> bool:
     return bool((np.abs(target - np.array(controller.meta["nominal_pose"])) <= reach + 1e-4).all())
 
 
-@counts
+@counts_of(500)
 def test_numbers_of_any_size_give_targets_in_their_range_or_one_error(controller: Any, count: int) -> None:
     names = sorted(ordinary(controller))
     refused: list[str] = []
@@ -99,7 +99,7 @@ def test_numbers_of_any_size_give_targets_in_their_range_or_one_error(controller
     assert any("is not finite" in text for text in refused)
 
 
-@counts
+@counts_of(500)
 def test_readings_of_any_kind_give_one_error(controller: Any, count: int) -> None:
     names = [*sorted(ordinary(controller)), "speed", "state", ""]
 

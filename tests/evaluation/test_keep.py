@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
+import os
 import shutil
+import signal
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -16,6 +20,7 @@ from pace.evaluation.publish import KeepError, keep
 from pace.rl.policies import load_policy
 from pace.runs.checkpoint import export_weights
 from pace.runs.own_files import LIST
+from pace.runs.whole_folder import LOCK, clear_leftovers, replaced
 from tests.helpers.saved import save_run
 
 ROW = {"serve": "mid_long", "serves": 5120, "hit": 0.995, "hit_low": 0.991, "hit_high": 0.997}
@@ -24,6 +29,8 @@ EVALUATED = {
     "rows": [ROW], "physics_dt": 0.002, "num_worlds": 256, "warmup_serves": 2, "seed": 1,
     "overrides": ["engine.physics_dt=0.002", "engine.threads=1", "sensing=paper"],
 }  # fmt: skip
+
+FORK = multiprocessing.get_context("fork")
 
 
 def run_main(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
@@ -220,6 +227,69 @@ def test_a_folder_that_cannot_be_replaced_is_put_back(
     monkeypatch.undo()
     keep(run, tmp_path / "kept")
     assert {path.name for path in tmp_path.iterdir()} == {"run", "kept"}
+
+
+@pytest.mark.parametrize("last", ["card", "rename to old", "rename to kept", "remove"])
+def test_what_a_killed_call_has_left_is_finished_or_undone_by_the_next(last: str, tmp_path: Path) -> None:
+    run, kept = save_run(tmp_path / "run"), tmp_path / "policies" / "kept"
+    keep(run, kept, notes="Old note.")
+    (kept / "notes.txt").write_text("mine")
+    before = files_of(kept)
+
+    def work() -> None:
+        """Publish again, and be killed before something is done."""
+
+        def kill(*_: object, **__: object) -> None:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+        def rename(self: Path, target: Path, rename: Callable[[Path, Path], Path] = Path.rename) -> Path:
+            if self.name == "kept" and last == f"rename to {target.name}":
+                kill()
+            return rename(self, target)
+
+        Path.rename = rename  # type: ignore[method-assign]
+        if last == "card":
+            publish.card = kill  # type: ignore[assignment]
+        if last == "remove":
+            shutil.rmtree = kill  # type: ignore[assignment]
+        keep(run, kept, notes="New note.")
+
+    process = FORK.Process(target=work)
+    process.start()
+    process.join()
+    assert process.exitcode == -signal.SIGKILL
+    left = [path.name for path in kept.parent.iterdir() if path.name != "kept"]
+    assert len(left) == 1
+    assert kept.exists() == (last != "rename to kept")
+    clear_leftovers(kept.parent)
+    assert [path.name for path in kept.parent.iterdir()] == ["kept"]
+    assert (kept / "notes.txt").read_text() == "mine"
+    assert (files_of(kept) == before) == (last != "remove")  # then the new one was complete
+    keep(kept, tmp_path / "policies" / "other")
+    assert {path.name for path in kept.parent.iterdir()} == {"kept", "other"}
+
+
+def test_what_lives_or_is_somebody_elses_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run, place = save_run(tmp_path / "run"), tmp_path / "policies"
+    theirs = place / ".pace_new_theirs"
+    theirs.mkdir(parents=True)
+    (theirs / "thesis.txt").write_text("years of work")
+    (place / ".pace_new_file").write_text("no folder")
+    (place / ".pace_new_link").symlink_to(run)
+    with replaced(place / "kept") as fresh:  # which another process is about to finish
+        fresh.mkdir()
+        before = files_of(tmp_path)
+        clear_leftovers(place)
+        assert files_of(tmp_path) == before
+    lost = place / ".pace_new_lost"  # killed before it had replaced kept, which was made again since
+    for part in ("old", "fresh"):
+        (lost / part / "kept").mkdir(parents=True)
+    (lost / "old" / "notes.txt").write_text("mine")
+    (lost / LOCK).touch()
+    keep(run, place / "kept")
+    assert (lost / "old" / "notes.txt").read_text() == "mine"
+    assert (theirs / "thesis.txt").read_text() == "years of work"
+    assert "both stay" in capsys.readouterr().err
 
 
 def test_a_strangers_folder_is_no_published_policy_and_files_in_one_are_the_users(tmp_path: Path) -> None:

@@ -1,4 +1,5 @@
-"""Property-based tests: a few examples by default, a thousand in the long suite, the same each time."""
+"""Property-based tests: of light examples a thousand for each kind of input by default, of the others some; a thousand
+for each test in the long suite. The same each time."""
 
 from __future__ import annotations
 
@@ -10,8 +11,13 @@ import pytest
 hypothesis = pytest.importorskip("hypothesis")
 st = pytest.importorskip("hypothesis.strategies")
 
-#: Parameter of a test: how many examples.
-counts = pytest.mark.parametrize("count", [20, pytest.param(1000, marks=pytest.mark.long)], ids=["few", "many"])
+
+def counts_of(few: int, many: int = 1000) -> pytest.MarkDecorator:
+    """Parameter of a test: how many examples, by default and in the long suite."""
+    return pytest.mark.parametrize("count", [few, pytest.param(many, marks=pytest.mark.long)], ids=["few", "many"])
+
+
+counts = counts_of(20)
 
 
 def check(count: int, *strategies: Any) -> Callable[[Callable[..., None]], None]:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from pace.predictor.forecast import forecast_flight
-from tests.helpers.examples import any_vectors, check, counts
+from tests.helpers.examples import any_vectors, check, counts_of
 
 SERVED = torch.tensor([[1.3, 0.0, 1.0], [-6.0, 0.0, 1.5], [0.0, 0.0, 0.0]])
 
@@ -18,7 +18,7 @@ def forecast(first: Tensor) -> dict[str, Tensor]:
     return {name: value.clone() for name, value in found.items() if isinstance(value, Tensor)}
 
 
-@counts
+@counts_of(1000, 5000)
 def test_any_ball_has_a_forecast_and_others_do_not_notice(count: int) -> None:
     alone = forecast(SERVED)
     assert alone

@@ -23,7 +23,7 @@ from pace.rl.policies import load_policy
 from pace.runs.checkpoint import META, TRAINING, WEIGHTS, CheckpointError, load_checkpoint
 from pace.runs.metrics_file import MetricsFile, read_rows
 from pace.runs.run_folder import RunFolder
-from tests.helpers.examples import assert_one_line, check, counts, json_values, st
+from tests.helpers.examples import assert_one_line, check, counts, counts_of, json_values, st
 from tests.helpers.saved import save_run
 from tests.helpers.training import dummy_trainer
 
@@ -79,7 +79,7 @@ def inserted(data: bytes, at: float, more: bytes) -> bytes:
     return data[: int(at * len(data))] + more + data[int(at * len(data)) :]
 
 
-@counts
+@counts_of(334)
 @pytest.mark.parametrize("name", [META, WEIGHTS, TRAINING])
 def test_damaged_bytes(name: str, count: int, original: dict[str, bytes], tmp_path: Path) -> None:
     @check(count, damages())
