@@ -15,7 +15,7 @@ from pace.config.names import check_renamed, split_override
 HYDRA_OPTIONS = ("--cfg", "-c", "--info", "-i", "--package", "-p", "--config-name", "-cn", "--config-dir", "-cd")
 
 #: Keys whose value is a path, of any command.
-PATHS = ("out", "run", "resume", "init_from", "predictor_from", "video", "evaluation", "notes", "figure")
+PATHS = ("out", "run", "resume", "init_from", "predictor_from", "video", "evaluation", "notes", "figure", "log")
 
 #: Tables of the configuration with keys of the users' own.
 OPEN_TABLES = ("reward.terms.", "observation.estimates.")

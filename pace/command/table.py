@@ -120,6 +120,19 @@ COMMANDS = {
         examples=("pretrained/pace", "runs/2026-01-01_pace out=runs/robot"),
         positional=("run",),
     ),
+    "retrace": Command(
+        module="pace.deploy.retrace",
+        work="pace.deploy.trace:retrace_from_config",
+        failures=("pace.deploy.trace:RetraceError",),
+        extra="export",
+        config="retrace",
+        summary="a robot's log through the exported file: where its targets part from the recorded ones",
+        usage="POLICY LOG [key=value ...]",
+        about="POLICY is policy.onnx or its folder, LOG what the robot has recorded (docs/robot.md). Prints the first "
+        "step at which they part, and what was unusual: late steps, old frames, readings that the policy refuses.",
+        examples=("robot/policy.onnx robot/monday.log", "robot robot/monday.log tolerance=1e-3 out=runs/monday"),
+        positional=("policy", "log"),
+    ),
     "ablate": Command(
         module="pace.studies.ablate",
         work="pace.studies.ablation:ablate_from_config",

@@ -1,4 +1,4 @@
-"""The other commands: bench, evaluate, export, play, ablate, compare, keep, validate, studies."""
+"""The other commands: bench, evaluate, export, retrace, play, ablate, compare, keep, validate, studies."""
 
 from __future__ import annotations
 
@@ -143,6 +143,23 @@ class ExportConfig:
         require(self.run is not None, "which run? give its folder, a checkpoint or pretrained/<name>")
         for name in ("check_worlds", "check_steps"):
             require(getattr(self, name) >= 1, f"{name} must be at least 1, got {getattr(self, name)}")
+
+
+@dataclass
+class RetraceConfig:
+    """``python -m pace.deploy.retrace``: the exported policy, the log, and what counts as a difference."""
+
+    policy: str | None
+    log: str | None
+    tolerance: float  # rad
+    late: float  # share of control_dt
+    out: str | None
+
+    def __post_init__(self) -> None:
+        require(self.policy is not None, "which policy? give policy.onnx of pace export, then the log")
+        require(self.log is not None, "which log? give the file that the robot has recorded, after policy.onnx")
+        for name in ("tolerance", "late"):
+            require(getattr(self, name) > 0, f"{name} must be positive, got {getattr(self, name)}")
 
 
 @dataclass
