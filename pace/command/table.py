@@ -107,6 +107,22 @@ COMMANDS = {
         training_keys=TASK_VALUES,
         collected=True,
     ),
+    "watch": Command(
+        module="pace.viewer.watch",
+        work="pace.viewer.following:watch_from_config",
+        failures=(CHECKPOINT_ERROR, "pace.viewer.server:PageError"),
+        extra="viewer",
+        config="watch",
+        summary="the newest policy of a run that trains, on a live page with its reward terms",
+        usage="RUN [key=value ...]",
+        about="The page of pace play, which takes each new checkpoint of the run when it is written. Start it in a "
+        "second terminal; it waits for the first checkpoint.",
+        examples=("runs/2026-01-01_pace", "runs/2026-01-01_pace port=9000 serve=short rewards=false"),
+        positional=("run",),
+        groups=(*TASK_GROUPS, "engine"),
+        training_keys=TASK_VALUES,
+        collected=True,
+    ),
     "export": Command(
         module="pace.deploy",
         work="pace.deploy.export:export_from_config",

@@ -193,6 +193,26 @@ class PlayConfig:
 
 
 @dataclass
+class WatchConfig:
+    """``python -m pace.viewer.watch``: the run that trains, and the page."""
+
+    run: str | None
+    rewards: bool
+    host: str
+    port: int
+    speed: float  # of time; 1: real time
+    seed: int
+    physics_dt: float  # s
+    overrides: list[str]  # of the saved task
+    plugins: list[str] = field(default_factory=list)  # modules that add what the saved task needs
+
+    def __post_init__(self) -> None:
+        require(self.run is not None, "which run? give its folder, which pace train has named")
+        require(0 < self.speed <= 1, f"speed must lie in (0, 1], got {self.speed}")
+        require(1 <= self.port <= 65535, f"port must lie in 1 to 65535, got {self.port}")
+
+
+@dataclass
 class AblateConfig:
     """``python -m pace.studies.ablate``: the experiments, their seeds, and their length."""
 
