@@ -20,7 +20,7 @@ import mujoco
 import torch
 from omegaconf import DictConfig
 
-from pace.config.base import parse, to_dict
+from pace.config.base import compose, parse, to_dict
 from pace.config.commands import ExportConfig
 from pace.config.training import TrainConfig
 from pace.deploy import contract
@@ -73,6 +73,16 @@ def export_from_config(composed: DictConfig) -> None:
     for name, value in differences.items():
         print(f"  {name:<20}{value:.1e} {units.get(name, '(state)')}")
     print(f"wrote {out} ({out.stat().st_size / 2**20:.2f} MiB)\nwrote {out.with_suffix('.json')}")
+
+
+def export_run(run: Path) -> Path:
+    """Export a run's newest policy into its folder, as ``pace export`` does if nothing else is asked; the file.
+
+    Errors: :class:`ExportError`.
+    """
+    usual = parse(compose("export", [f"run='{run}'"]), ExportConfig)
+    export_policy(load_policy(run), run / FILE, usual)
+    return run / FILE
 
 
 def export_policy(policy: TaskPolicy, out: Path, config: ExportConfig) -> dict[str, float]:

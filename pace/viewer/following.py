@@ -9,7 +9,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from pace.config.base import parse
-from pace.config.commands import WatchConfig
+from pace.config.page import WatchConfig
 from pace.evaluation.sweep import ball_presets
 from pace.rl.policies import TaskPolicy, load_policy
 from pace.runs.checkpoint_folders import CheckpointError, list_checkpoints

@@ -10,7 +10,7 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from pace.config.base import ConfigError, compose, parse
-from pace.config.commands import PlayConfig
+from pace.config.page import PlayConfig
 from pace.evaluation.sweep import ball_presets
 from pace.rl.policies import TaskPolicy, load_policy
 from pace.runs.own_files import started_out

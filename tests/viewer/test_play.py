@@ -18,7 +18,8 @@ import torch
 from pace.command.arguments import name_options
 from pace.command.table import COMMANDS
 from pace.config.base import ConfigError, compose, parse
-from pace.config.commands import ExportConfig, PlayConfig
+from pace.config.commands import ExportConfig
+from pace.config.page import PlayConfig
 from pace.deploy.export import ExportError, export_policy
 from pace.rl.policies import TaskPolicy, built_in_policy, load_policy
 from pace.runs.checkpoint_folders import list_checkpoints
