@@ -149,8 +149,9 @@ def check_keys(name: str, command: Command, arguments: Sequence[str]) -> None:
     for argument in plain_overrides(arguments):
         key, _ = split_override(argument)
         root = key.replace("/", ".").replace("@", ".").split(".")[0]
-        if key in command.refused:
-            raise ConfigError(f"{key}= is no key of pace {name}: {command.refused[key]}")
+        for refused, why in command.refused.items():
+            if key == refused or ("." in refused and key.startswith(f"{refused}.")):
+                raise ConfigError(f"{key}= is no key of pace {name}: {why}")
         if "=" not in argument and not argument.startswith("~"):
             raise ConfigError(f"'{argument}' is no key=value (--help lists the keys)")
         if root in (*known, "hydra") or (more_groups and argument.startswith("+")):

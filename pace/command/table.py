@@ -11,6 +11,8 @@ TRAIN_GROUPS = (
     "robot", "ball", "serve", "reset", "reward", "randomization", "sensing", "observation", "engine", "algo",
     "predictor", "experiment",
 )  # fmt: skip
+#: Of commands that only play: no reward is computed there.
+NO_REWARD = dict.fromkeys(("reward.terms", "reward.scale"), "no reward is computed; pace train and pace watch do that")
 CHECKPOINT_ERROR = "pace.runs.checkpoint:CheckpointError"
 SAVED_RUN = (
     "RUN is a run folder, a checkpoint in one, or the name of a published policy (campaign). The task is the one saved "
@@ -80,7 +82,7 @@ COMMANDS = {
         groups=(*TASK_GROUPS, "engine"),
         training_keys=TASK_VALUES,
         collected=True,
-        refused={"serve": "rows= names the serve ranges, such as rows=[short]"},
+        refused={"serve": "rows= names the serve ranges, such as rows=[short]", **NO_REWARD},
     ),
     "play": Command(
         module="pace.viewer",
@@ -100,12 +102,14 @@ COMMANDS = {
             "pretrained/pace",
             "pretrained/pace ball=paper serve=short port=9000",
             "runs/2026-01-01_pace --video out.mp4 seconds=30 speed=0.25",
+            "policy=zero serve=short        # the task, before there is a policy: also policy=random",
         ),
         positional=("run",),
         options=("video",),
         groups=(*TASK_GROUPS, "engine"),
         training_keys=TASK_VALUES,
         collected=True,
+        refused=NO_REWARD,
     ),
     "watch": Command(
         module="pace.viewer.watch",
@@ -195,7 +199,7 @@ COMMANDS = {
         groups=(*TASK_GROUPS, "engine"),
         training_keys=TASK_VALUES,
         collected=True,
-        refused={"serve": "rows= names the serve ranges, such as rows=[short]"},
+        refused={"serve": "rows= names the serve ranges, such as rows=[short]", **NO_REWARD},
     ),
     "keep": Command(
         module="pace.evaluation.keep",

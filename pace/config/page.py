@@ -12,6 +12,7 @@ class PlayConfig:
     """``python -m pace.viewer``: the policy, and the page or the video."""
 
     run: str | None
+    policy: str  # run, zero, random
     host: str
     port: int
     speed: float  # of time; 1: real time
@@ -27,6 +28,7 @@ class PlayConfig:
 
     def __post_init__(self) -> None:
         require(self.run is not None, "which run? give its folder, a checkpoint or pretrained/<name>")
+        require(self.policy in ("run", "zero", "random"), f"policy must be run, zero or random, not {self.policy!r}")
         require(0 < self.speed <= 1, f"speed must lie in (0, 1], got {self.speed}")
         require(1 <= self.port <= 65535, f"port must lie in 1 to 65535, got {self.port}")
         require(self.video is None or self.video.endswith(".mp4"), f"video must end in .mp4, got {self.video}")

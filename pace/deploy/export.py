@@ -22,6 +22,7 @@ from omegaconf import DictConfig
 
 from pace.config.base import compose, parse, to_dict
 from pace.config.commands import ExportConfig
+from pace.config.extras import cure
 from pace.config.training import TrainConfig
 from pace.deploy import contract
 from pace.deploy.check import compare, open_session
@@ -122,7 +123,7 @@ def _require_packages() -> None:
         import onnxruntime
         import onnxscript
     except ImportError as error:
-        raise ExportError(f"{error}: pip install 'pace-table-tennis[export]'") from error
+        raise ExportError(f"{error}: {cure('export')}") from error
     del onnx, onnxruntime, onnxscript
 
 

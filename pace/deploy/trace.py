@@ -13,6 +13,7 @@ from omegaconf import DictConfig
 
 from pace.config.base import parse
 from pace.config.commands import RetraceConfig
+from pace.config.extras import cure
 from pace.deploy.player import Controller, read_log
 from pace.runs.files import reason, write_figure
 from pace.runs.own_files import started_out
@@ -142,7 +143,7 @@ def retrace_from_config(composed: DictConfig) -> None:
     except ValueError as error:
         raise RetraceError(f"{file} cannot be used: {error}") from error
     except ModuleNotFoundError as error:
-        raise RetraceError(f"{error}: pip install 'pace-table-tennis[export]'") from error
+        raise RetraceError(f"{error}: {cure('export')}") from error
     try:
         log = read_log(config.log, {**controller.sizes, "joint_target": len(controller.contract["joint_names"])})
     except ValueError as error:

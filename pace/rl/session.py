@@ -43,6 +43,7 @@ from pace.rl.judge import Judge
 from pace.rl.kernels import warm
 from pace.rl.plan import in_millions
 from pace.rl.policies import locate
+from pace.rl.start import other_choices
 from pace.rl.trainer import Summary, Trainer, device_type_of, restarts_worlds
 from pace.runs.checkpoint import Checkpoint, CheckpointError, load_checkpoint
 from pace.runs.checkpoint_folders import FOLDER, NAME
@@ -221,7 +222,10 @@ def build_trainer(
     if saved:
         trainer.resume(saved)
     elif start:
-        trainer.start_from(start)
+        try:
+            trainer.start_from(start)
+        except CheckpointError as error:
+            raise CheckpointError(f"{error}{other_choices(config, start.config)}") from error
     return trainer
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from pace.config.base import ConfigError
+from pace.config.extras import cure
 from pace.runs.files import say, write_whole
 
 LOGGERS = ("wandb",)
@@ -29,7 +30,7 @@ def require_logger(logger: str | None) -> None:
     if logger not in LOGGERS:
         raise ConfigError(f"logger must be null or {', '.join(LOGGERS)}, not {logger!r} (tensorboard=true is apart)")
     if find_spec("wandb") is None:
-        raise ConfigError("logger=wandb needs the package wandb: pip install 'pace-table-tennis[wandb]'")
+        raise ConfigError(f"logger=wandb needs the package wandb: {cure('wandb')}")
 
 
 class Tracker:

@@ -9,6 +9,7 @@ from contextlib import redirect_stdout
 from io import StringIO
 from typing import Any
 
+from pace.config.extras import cure
 from pace.viewer.gate import Gate
 
 LOCAL = "127.0.0.1"
@@ -23,7 +24,7 @@ def require_viewer() -> None:
     try:
         import mjviser
     except ImportError as error:
-        raise PageError(f"{error}: pip install 'pace-table-tennis[viewer]'") from error
+        raise PageError(f"{error}: {cure('viewer')}") from error
     del mjviser
 
 

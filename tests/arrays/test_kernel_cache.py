@@ -65,7 +65,8 @@ def test_a_line_of_native_code_is_left_out_and_others_stay(capfd: pytest.Capture
             os.write(2, b"no driver\nwhy\n")
             raise RuntimeError
 
-    pytest.raises(RuntimeError, fail)
+    with pytest.raises(RuntimeError):
+        fail()
     os.write(2, b"no driver\n")  # again as before
     assert capfd.readouterr().err == "why\nno driver\n"
 

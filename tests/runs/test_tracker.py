@@ -98,9 +98,7 @@ def test_a_missing_package_names_the_extra_and_leaves_no_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tracker, "find_spec", lambda name: None)
-    with pytest.raises(
-        ConfigError, match=r"logger=wandb needs the package wandb: pip install 'pace-table-tennis\[wandb\]'"
-    ):
+    with pytest.raises(ConfigError, match=r"logger=wandb needs the package wandb: pip install .*wandb"):
         RunFolder(tmp_path / "run", {}, tensorboard=False, logger="wandb")
     with pytest.raises(ConfigError, match="logger must be null or wandb, not 'tensorboard'"):
         RunFolder(tmp_path / "run", {}, tensorboard=False, logger="tensorboard")
