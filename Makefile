@@ -67,14 +67,16 @@ venv:  ## make or renew .venv from requirements.lock
 
 # Resolves pyproject.toml anew for all platforms, with the hashes of all files of a release; torch stays at the version
 # pinned below. What PyPI's torch for Linux needs besides, for a GPU, is in a lock of its own: a CPU build does without.
+# The extra wandb is left out: with it come twenty packages that no run needs.
 lock: TORCH := 2.13.0
+lock: LOCKED_EXTRAS = $(shell sed -n '/optional-dependencies/,/^$$/s/^\([a-z]*\) = .*/--extra \1/p' pyproject.toml | grep -v wandb)
 lock: CPU_WHEELS ?= $(wildcard /opt/wheels/torch-$(TORCH)+cpu-*.whl)
 lock:  ## renew requirements.lock and requirements-cuda.lock
 	@set -e; scratch=$$(mktemp -d); trap 'rm -rf "$$scratch"' EXIT; \
 	python3 -m venv $$scratch; $$scratch/bin/pip install --quiet uv; \
 	echo "torch==$(TORCH)" > $$scratch/pins; \
 	$$scratch/bin/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate \
-	  --all-extras --constraint $$scratch/pins $(LOCK_ARGS) pyproject.toml > $$scratch/all; \
+	  $(LOCKED_EXTRAS) --constraint $$scratch/pins $(LOCK_ARGS) pyproject.toml > $$scratch/all; \
 	for wheel in $(CPU_WHEELS); do \
 	  hash=$$(sha256sum "$$wheel" | cut -d ' ' -f 1); \
 	  sed -i "s|^torch==.*|&\n    --hash=sha256:$$hash \\\\|" $$scratch/all; \

@@ -13,8 +13,8 @@ from pace.lazy import on_first_use
 from pace.moved import MovedCommands
 
 if TYPE_CHECKING:
+    from pace.rl.environment import make_env
     from pace.rl.policies import load_policy
-    from pace.task.env import make_env
 
 __version__ = "0.1.0"
 __all__ = ["load_policy", "make_env"]
@@ -23,4 +23,4 @@ sys.meta_path.append(MovedCommands())
 # whoever shares them, a run's own too: beside other programs, one process does five times the steps if they sleep.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-__getattr__ = on_first_use(__name__, {"load_policy": "pace.rl.policies", "make_env": "pace.task.env"})
+__getattr__ = on_first_use(__name__, {"load_policy": "pace.rl.policies", "make_env": "pace.rl.environment"})

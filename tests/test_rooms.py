@@ -31,6 +31,7 @@ ORDER = (
     ("onboard",),
     ("task",),
     ("rl",),
+    ("interfaces",),
     ("evaluation",),
     ("deploy",),
     ("viewer",),

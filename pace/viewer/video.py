@@ -11,6 +11,7 @@ from typing import Protocol
 import mujoco
 import numpy as np
 
+from pace.config.extras import cure
 from pace.config.sim import SimConfig
 from pace.sim.render import Picture, RenderError, SceneRenderer, caption, top_camera
 from pace.sim.robot import build_model
@@ -77,7 +78,7 @@ def write_video(
     try:
         import imageio_ffmpeg
     except ImportError as error:
-        raise RenderError(f"{error}: pip install 'pace-table-tennis[viewer]'") from error
+        raise RenderError(f"{error}: {cure('viewer')}") from error
     film = pictures(show, seconds, fps, speed, width, height)
     first = next(film)  # fails without OpenGL, before the file is made
     part = file.with_name(f".{file.stem}.{os.getpid()}.tmp{file.suffix}")  # the encoder goes by the suffix

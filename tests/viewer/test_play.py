@@ -18,7 +18,8 @@ import torch
 from pace.command.arguments import name_options
 from pace.command.table import COMMANDS
 from pace.config.base import ConfigError, compose, parse
-from pace.config.commands import ExportConfig, PlayConfig
+from pace.config.commands import ExportConfig
+from pace.config.page import PlayConfig
 from pace.deploy.export import ExportError, export_policy
 from pace.rl.policies import TaskPolicy, built_in_policy, load_policy
 from pace.runs.checkpoint_folders import list_checkpoints
@@ -134,6 +135,7 @@ def test_video_option() -> None:
         ("width=321", "even number"),
         ("port=0", "port must lie"),
         ("seconds=0", "seconds must be positive"),
+        ("policy=none", "policy must be run, zero or random, not 'none'"),
     ],
 )
 def test_wrong_values(override: str, message: str) -> None:
@@ -177,6 +179,16 @@ def run_main(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     return main()
 
 
+def test_a_task_is_shown_without_a_trained_policy(policy: TaskPolicy, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[TaskPolicy] = []
+    monkeypatch.setattr("pace.viewer.play.page", lambda config, policy, overrides: shown.append(policy))
+    for name in ("zero", "random"):
+        assert run_main(monkeypatch, policy.source, f"policy={name}") == 0
+        assert shown[-1].config == policy.config
+    observation = torch.zeros(2, 3)
+    assert [float(each(observation).abs().max()) > 0.0 for each in shown] == [False, True]
+
+
 def test_bad_input_is_one_line(
     policy: TaskPolicy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -207,11 +219,11 @@ def test_missing_packages_are_named(monkeypatch: pytest.MonkeyPatch, policy: Tas
     monkeypatch.setitem(sys.modules, "mjviser", None)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     monkeypatch.setitem(sys.modules, "onnxscript", None)
-    with pytest.raises(PageError, match=r"mjviser.*pip install 'pace-table-tennis\[viewer\]'"):
+    with pytest.raises(PageError, match=r"mjviser.*pip install .*(mjviser|\[viewer\])"):
         require_viewer()
-    with pytest.raises(RenderError, match=r"imageio_ffmpeg.*pip install 'pace-table-tennis\[viewer\]'"):
+    with pytest.raises(RenderError, match=r"imageio_ffmpeg.*pip install .*(imageio-ffmpeg|\[viewer\])"):
         write_video(tmp_path / "a.mp4", standing(), 0.1, 20, 1.0, 64, 64)
-    with pytest.raises(ExportError, match=r"onnxscript.*pip install 'pace-table-tennis\[export\]'"):
+    with pytest.raises(ExportError, match=r"onnxscript.*pip install .*(onnxscript|\[export\])"):
         export_policy(policy, tmp_path / "a.onnx", parse(compose("export", ["run=any"]), ExportConfig))
 
 
