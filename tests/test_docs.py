@@ -15,7 +15,7 @@ from pace.moved import MOVED
 from pace.studies import architecture
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 NAME = re.compile(r"\bpace(?:\.\w+)+")
 ENTRY_POINTS = {"pace.reward_terms", "pace.observations", "pace.critic_observations", "pace.algorithms", "pace.engines"}
 NOT_NAMES = ENTRY_POINTS | {"pace.predictors"}
