@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from pace.rl.policies import load_policy
     from pace.task.env import make_env
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = ["load_policy", "make_env"]
 sys.meta_path.append(MovedCommands())
 
