@@ -45,7 +45,9 @@ def commands() -> list[tuple[str, list[str]]]:
     return [(page, words) for page, words in found if not set(LEFT_OUT) & set(words)]
 
 
-@pytest.mark.parametrize(("page", "words"), commands(), ids=lambda part: part if isinstance(part, str) else "-".join(part[:3]))
+@pytest.mark.parametrize(
+    ("page", "words"), commands(), ids=lambda part: part if isinstance(part, str) else "-".join(part[:3])
+)
 def test_a_command_composes(page: str, words: list[str]) -> None:
     _, name, *arguments = words
     overrides = prepare(name, arguments)

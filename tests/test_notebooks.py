@@ -64,7 +64,9 @@ def test_a_notebook_runs(name: str) -> None:
 @pytest.mark.parametrize("name", NOTEBOOKS)
 def test_a_notebook_is_stored_with_its_outputs(name: str) -> None:
     check(name, outputs(read(name)))
-    assert not [output for output in outputs(read(name)) if output.output_type == "error" or output.get("name") == "stderr"]
+    assert not [
+        output for output in outputs(read(name)) if output.output_type == "error" or output.get("name") == "stderr"
+    ]
     assert (ROOT / "notebooks" / name).stat().st_size < LARGEST
 
 

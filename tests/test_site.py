@@ -1,4 +1,4 @@
-"""The documentation as a site: its pages are in the navigation, its reference is of today's code, and it builds clean."""
+"""The documentation as a site: all pages are in the navigation, the reference is of today's code, it builds clean."""
 
 from __future__ import annotations
 

@@ -76,7 +76,9 @@ def test_it_carries_the_package_its_configs_and_its_models_and_nothing_else(whee
 
 def test_it_carries_its_licences(wheel: Path) -> None:
     with ZipFile(wheel) as opened:
-        texts = {name.rsplit("/", 1)[1]: opened.read(name).decode() for name in opened.namelist() if "/licenses/" in name}
+        texts = {
+            name.rsplit("/", 1)[1]: opened.read(name).decode() for name in opened.namelist() if "/licenses/" in name
+        }
     assert set(texts) == {"LICENSE", "NOTICE"}
     for word in ("booster_gym", "booster_assets", "TTRL-ICRA2026", "BSD 3-Clause", "MIT License", "pretrained/"):
         assert word in texts["NOTICE"]
@@ -127,7 +129,9 @@ def test_its_own_policy_evaluates_and_plays(installed: Path, empty: Path) -> Non
 def test_the_source_archive_has_what_the_documentation_and_the_tests_need(tmp_path: Path) -> None:
     tools = tmp_path / "tools"
     run(sys.executable, "-m", "pip", "install", "--quiet", "--target", tools, "hatchling>=1.27", folder=tmp_path)
-    code = "import sys; sys.path.insert(0, sys.argv[1]); from hatchling.build import build_sdist; build_sdist(sys.argv[2])"
+    code = (
+        "import sys; sys.path.insert(0, sys.argv[1]); from hatchling.build import build_sdist; build_sdist(sys.argv[2])"
+    )
     run(sys.executable, "-c", code, tools, tmp_path, folder=ROOT)
     (file,) = tmp_path.glob("*.tar.gz")
     with tarfile.open(file) as opened:

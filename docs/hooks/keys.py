@@ -109,7 +109,12 @@ def class_table(owner: type) -> str:
     """The fields of a class whose members are in a list or a table of YAML."""
     said = field_comments(owner)
     rows = [
-        (f"`{field.name}`", cell(type_text((owner, field.name))), range_text((owner, field.name)), cell(said.get(field.name, "")))
+        (
+            f"`{field.name}`",
+            cell(type_text((owner, field.name))),
+            range_text((owner, field.name)),
+            cell(said.get(field.name, "")),
+        )
         for field in fields(owner)
     ]
     return table(("key", "type", "range", "meaning, unit"), rows)
@@ -130,7 +135,11 @@ def group_page(group: str, owner: type, default: str, about: str) -> str:
     """All choices of a group: the default one whole, of the others what differs."""
     files = {choice: config_dir() / group / f"{choice}.yaml" for choice in choices(group)}
     first = {name: key for name, key in file_keys(files[default]).items() if name != "name"}
-    parts = [f"# {group}", about, f"`pace train {group}=CHOICE` takes one, `pace train {group}.KEY=VALUE` changes a number."]
+    parts = [
+        f"# {group}",
+        about,
+        f"`pace train {group}=CHOICE` takes one, `pace train {group}.KEY=VALUE` changes a number.",
+    ]
     parts += [f"## {group}={default}", f"The default. {heading(files[default])}".strip()]
     parts.append(key_table(list(first.values()), owner, f"{group}."))
     for choice, file in files.items():

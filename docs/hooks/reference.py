@@ -9,6 +9,7 @@ from typing import get_type_hints
 from keys import cell, group_page, key_table, table, value_table
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
 
 from pace.command.help import capital, command_keys, default_choices
 from pace.command.keys import file_keys, heading
@@ -20,6 +21,7 @@ from pace.task.body_rewards import MEASURED
 from pace.task.measures import Measures
 from pace.task.rewards import TERMS
 
+ROLE = re.compile(r":(?:func|class|meth|mod|data|attr|exc):(?=<code>)")
 #: Modules whose public names are the API, with a heading each.
 API = {
     "Environments and policies": ("pace", "pace.task.env", "pace.rl.policies"),
@@ -47,16 +49,17 @@ GROUPS_ABOUT = {
 }
 INTRO = """# Configuration
 
-Every number of the task, the physics and the learning is in [configs/](../../../configs/train.yaml), with its unit and source. These pages are made from
-those files, from the dataclasses that check them (`pace/config/`), and from the ranges of [pace/config/limits.py](../../../pace/config/limits.py). An unknown
-key, a wrong type or a value out of range is one line that names the key.
+Every number of the task, the physics and the learning is in [configs/](../../../configs/train.yaml), with its unit and
+source. These pages are made from those files, from the dataclasses that check them (`pace/config/`), and from the
+ranges of [pace/config/limits.py](../../../pace/config/limits.py). An unknown key, a wrong type or a value out of range
+is one line that names the key.
 
 | to | write |
 |---|---|
 | take another choice of a group | `ball=paper` |
 | change one number | `algo.gamma=0.97`, `serve.vx=[-6,-5]` |
 | add a reward term, or remove one | `+reward.terms.NAME={...}`, `~reward.terms.NAME` |
-| have choices of your own | `--config-dir FOLDER`, with `FOLDER/ball/mine.yaml` ([Adding something](../../extend.md)) |
+| have choices of your own | `--config-dir FOLDER`, with `FOLDER/ball/mine.yaml` ([recipes](../../extend.md)) |
 
 `pace train --help` and `pace train --help ball` print the same in the terminal.
 """
@@ -69,6 +72,11 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for name, text in pages.items():
         files.append(File.generated(config, f"reference/{name}", content=text))
     return files
+
+
+def on_page_content(content: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Docstrings name functions and classes as Sphinx does; here the name is enough."""
+    return ROLE.sub("", content)
 
 
 def commands_page() -> str:
@@ -99,7 +107,11 @@ def configuration_pages() -> dict[str, str]:
         pages[f"{group}.md"] = group_page(group, owners[group], defaults[group], about)
     assert set(GROUPS_ABOUT) | {"experiment"} == set(TRAIN_GROUPS)
     rows = [
-        (f"[{group}]({group}.md)", ", ".join(f"`{name}`" for name in choices(group)), GROUPS_ABOUT.get(group, "Sets of choices."))
+        (
+            f"[{group}]({group}.md)",
+            ", ".join(f"`{name}`" for name in choices(group)),
+            GROUPS_ABOUT.get(group, "Sets of choices."),
+        )
         for group in TRAIN_GROUPS
     ]
     shown = [(name, several, re.sub(r" [A-Z][\w ]+: \[.*", "", about)) for name, several, about in rows]
@@ -126,12 +138,16 @@ def rewards_page() -> str:
         params = ", ".join(f"`{param}`" for param in entry.params or ())
         rows.append((f"`{name}`", params, *weights, cell(_meaning(name))))
     head = ("term", "parameters", *(f"weight in {choice}" for choice in files), "what it is")
-    return (
-        "# Rewards\n\nA term is a function of the task's true state. The reward of a control step is the sum of `reward.scale` x weight x 0.02 s x term. "
-        "Weights and parameters: [configuration](configuration/reward.md). `metrics.csv` has a column `reward/NAME` for each term, the mean of its weighted value "
-        "per control step. A term of your own: [Adding something](../extend.md#a-reward-term).\n\n"
-        f"{table(head, rows)}\n"
-    )
+    return f"{REWARDS}\n{table(head, rows)}\n"
+
+
+REWARDS = """# Rewards
+
+A term is a function of the task's true state. The reward of a control step is the sum of `reward.scale` x weight x
+0.02 s x term. Weights and parameters: [configuration](configuration/reward.md). `metrics.csv` has a column
+`reward/NAME` for each term, the mean of its weighted value per control step. A term of your own:
+[Adding something](../extend.md#a-reward-term).
+"""
 
 
 def _weight(key: object) -> str:
@@ -139,17 +155,27 @@ def _weight(key: object) -> str:
     return found[1] if found else "-"
 
 
+def _measures() -> dict[str, str]:
+    """The comment of each measure; "the same" stands for what the one above says."""
+    found: dict[str, str] = {}
+    for name, said in re.findall(r"^    (\w+): .*# (.*)$", inspect.getsource(Measures), re.MULTILINE):
+        found[name] = list(found.values())[-1] if "the same" in said else said
+    return found
+
+
 def _meaning(name: str) -> str:
     """The docstring of a term, or the comment of the measure that it is."""
     if name in MEASURED:
-        said = re.search(rf"^    {MEASURED[name]}: .*# (.*)$", inspect.getsource(Measures), re.MULTILINE)
-        return said[1] if said else ""
+        return _measures()[MEASURED[name]]
     return re.sub(r"\s+", " ", (inspect.getdoc(TERMS[name].function) or "").replace("``", "`"))
 
 
 def api_page() -> str:
     """Public names of the modules that others build on."""
-    parts = ["# API", "Names that stay. Everything else may change between versions; [Architecture](../architecture.md) shows where it lies."]
+    parts = [
+        "# API",
+        "Names that stay. Everything else may change; [Architecture](../architecture.md) shows where it lies.",
+    ]
     for title, modules in API.items():
         parts.append(f"## {title}")
         parts += [f"::: {module}\n    options:\n      heading_level: 3" for module in modules]

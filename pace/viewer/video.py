@@ -63,8 +63,9 @@ def cameras(view: str) -> list[mujoco.MjvCamera]:
 def pictures(
     show: Shown, seconds: float, fps: int, speed: float, width: int, height: int, view: str = "both"
 ) -> Iterator[Picture]:
-    """``seconds`` of play at ``fps`` frames a second of video, time slowed by ``speed``: uint8 (H, width, 3), ``height``
-    for each camera of the view.
+    """``seconds`` of play at ``fps`` frames a second of video, time slowed by ``speed``: uint8 (H, width, 3).
+
+    H is ``height`` for each camera of the view.
 
     Errors: :class:`pace.sim.render.RenderError` without OpenGL.
     """
@@ -131,9 +132,7 @@ def write_h264(file: Path, film: Iterator[Picture], fps: int) -> None:
 
     first = next(film)
     size = (first.shape[1], first.shape[0])
-    writer = imageio_ffmpeg.write_frames(
-        str(file), size, fps=fps, codec="libx264", quality=7, macro_block_size=BLOCK
-    )
+    writer = imageio_ffmpeg.write_frames(str(file), size, fps=fps, codec="libx264", quality=7, macro_block_size=BLOCK)
     writer.send(None)
     for picture in chain([first], film):
         writer.send(np.ascontiguousarray(picture))

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 import torch
+from PIL import Image
 
 from pace.command.arguments import name_options
 from pace.command.table import COMMANDS
