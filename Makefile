@@ -7,7 +7,7 @@ ARGS ?=
 WORKERS ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help train test test-fast test-long gpu lint bench venv lock clean
+.PHONY: help train test test-fast test-long gpu lint bench docs wheel venv lock clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## ?/\1\t/' | expand -t 12
@@ -34,6 +34,13 @@ lint: venv  ## ruff and pyright
 
 bench: venv  ## measure speed and memory: python -m pace.bench $(ARGS)
 	$(BIN)/python -m pace.bench $(ARGS)
+
+docs: export NO_MKDOCS_2_WARNING := 1
+docs: venv  ## build the documentation as a site in build/site; a warning is an error
+	$(BIN)/python -m mkdocs build --strict $(ARGS)
+
+wheel: venv  ## build the wheel into dist/
+	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
 
 # The stamp holds what was installed; it is compared by content, since a checkout changes the times of files.
 # A CPU build of torch comes first, if pip is told where one lies: of files without a hash in their address pip takes none

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pace.rl.environment import make_env
     from pace.rl.policies import load_policy
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = ["load_policy", "make_env"]
 sys.meta_path.append(MovedCommands())
 # OpenMP reads it when torch is loaded. Its threads would spin while they wait for one another, and take the cores from

@@ -24,6 +24,7 @@ class PlayConfig:
     width: int  # pixels of each view
     height: int
     fps: int
+    view: str = "both"  # both or strike
     plugins: list[str] = field(default_factory=list)  # modules that add what the saved task needs
 
     def __post_init__(self) -> None:
@@ -31,7 +32,9 @@ class PlayConfig:
         require(self.policy in ("run", "zero", "random"), f"policy must be run, zero or random, not {self.policy!r}")
         require(0 < self.speed <= 1, f"speed must lie in (0, 1], got {self.speed}")
         require(1 <= self.port <= 65535, f"port must lie in 1 to 65535, got {self.port}")
-        require(self.video is None or self.video.endswith(".mp4"), f"video must end in .mp4, got {self.video}")
+        known = self.video is None or self.video.endswith((".mp4", ".webp", ".gif"))
+        require(known, f"video must end in .mp4, .webp or .gif, got {self.video}")
+        require(self.view in ("both", "strike"), f"view must be both or strike, got {self.view}")
         for name in ("seconds", "fps"):
             require(getattr(self, name) > 0, f"{name} must be positive, got {getattr(self, name)}")
         for name in ("width", "height"):

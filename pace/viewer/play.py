@@ -84,7 +84,9 @@ def film(config: PlayConfig, show: Shown, about: str) -> None:
     size = (config.width, config.height)
     interval = 0.2 if sys.stderr.isatty() else SECONDS_PER_LINE
     with tqdm(total=total, desc=file.name, unit="picture", mininterval=interval) as bar:
-        write_video(file, show, config.seconds, config.fps, config.speed, *size, on_picture=lambda: _tick(bar))
+        write_video(
+            file, show, config.seconds, config.fps, config.speed, *size, on_picture=lambda: _tick(bar), view=config.view
+        )
     print(f"{about}\n{show.text()}\nwrote {file}")
 
 

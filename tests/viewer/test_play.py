@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from pace.command.arguments import name_options
 from pace.command.table import COMMANDS
@@ -131,7 +132,8 @@ def test_video_option() -> None:
     ("override", "message"),
     [
         ("speed=2", "speed must lie in"),
-        ("video=a.gif", r"end in \.mp4"),
+        ("video=a.avi", r"end in \.mp4"),
+        ("view=near", "both or strike"),
         ("width=321", "even number"),
         ("port=0", "port must lie"),
         ("seconds=0", "seconds must be positive"),
@@ -154,6 +156,19 @@ def test_a_film_has_all_its_pictures(policy: TaskPolicy, tmp_path: Path) -> None
     assert count == len(seen) == 8  # 0.1 s of play, four times slower, 20 a second
     assert seconds == pytest.approx(0.4, abs=0.06)
     assert next(ffmpeg.read_frames(str(file)))["size"] == (128, 128)
+
+
+@pytest.mark.parametrize("suffix", ["webp", "gif"])
+def test_an_animation_has_all_its_pictures_of_one_view(suffix: str, policy: TaskPolicy, tmp_path: Path) -> None:
+    file = tmp_path / f"out.{suffix}"
+    try:
+        write_video(file, Show(policy, QUICK), 0.1, 20, 0.5, 128, 64, view="strike")
+    except RenderError as error:
+        pytest.skip(str(error))
+    with Image.open(file) as film:
+        assert (film.size, film.n_frames, film.info["loop"]) == ((128, 64), 4, 0)
+        film.load()
+        assert film.info["duration"] == 50
 
 
 def test_a_film_that_is_not_finished_leaves_the_old_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
