@@ -152,7 +152,7 @@ def train(env: GymnasiumEnv, s: Settings) -> list[float]:
     torch.manual_seed(s.seed)
     observation, _ = env.reset(seed=s.seed)
     seen = {name: torch.from_numpy(part) for name, part in observation.items()}
-    sizes = (seen["policy"].shape[1], seen["critic"].shape[1], env.action_space.shape[1])
+    sizes = (seen["policy"].shape[1], seen["critic"].shape[1], env.env.worlds.nominal.shape[0])
     agent = Agent(*sizes, s.hidden)
     agent.policy_norm.update(seen["policy"])
     agent.critic_norm.update(seen["critic"])

@@ -12,7 +12,9 @@ TRAIN_GROUPS = (
     "predictor", "experiment",
 )  # fmt: skip
 #: Of commands that only play: no reward is computed there.
-NO_REWARD = dict.fromkeys(("reward.terms", "reward.scale"), "no reward is computed; pace train and pace watch do that")
+NO_REWARD: dict[str, str] = dict.fromkeys(
+    ("reward.terms", "reward.scale"), "no reward is computed; pace train and pace watch do that"
+)
 CHECKPOINT_ERROR = "pace.runs.checkpoint:CheckpointError"
 SAVED_RUN = (
     "RUN is a run folder, a checkpoint in one, or the name of a published policy (campaign). The task is the one saved "

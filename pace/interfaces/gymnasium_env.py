@@ -73,8 +73,11 @@ class GymnasiumEnv(VectorEnv):
         self.single_action_space = spaces.Box(-clip, clip, (joints,), np.float32)
         self.action_space = spaces.Box(-clip, clip, (self.num_envs, joints), np.float32)
         groups = {"policy": env.policy_observation.shape[1], "critic": env.critic_observation.shape[1]}
-        single = {name: spaces.Box(-np.inf, np.inf, (size,), np.float32) for name, size in groups.items()}
-        batch = {name: spaces.Box(-np.inf, np.inf, (self.num_envs, size), np.float32) for name, size in groups.items()}
+        single: dict[str, spaces.Space[Any]] = {}
+        batch: dict[str, spaces.Space[Any]] = {}
+        for name, size in groups.items():
+            single[name] = spaces.Box(-np.inf, np.inf, (size,), np.float32)
+            batch[name] = spaces.Box(-np.inf, np.inf, (self.num_envs, size), np.float32)
         self.single_observation_space = single["policy"] if self._separate else spaces.Dict(single)
         self.observation_space = batch["policy"] if self._separate else spaces.Dict(batch)
 

@@ -42,7 +42,7 @@ class Tracker:
     """
 
     def __init__(self, path: Path, config: Mapping[str, Any]) -> None:
-        import wandb
+        import wandb  # type: ignore[import-not-found]  # an extra
 
         self._wandb = wandb
         try:
