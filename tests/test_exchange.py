@@ -38,14 +38,11 @@ def expected(size: int, rounds: int) -> list[str]:
     generators = [torch.Generator().manual_seed(rank) for rank in range(size)]
     lines = []
     for index in range(rounds):
-        parts = [
-            (torch.randn(1 + 37 * index, generator=g), torch.randn(5, 3, generator=g, dtype=torch.float64))
-            for g in generators
-        ]
-        first, second = (sum(part[which] for part in parts) for which in (0, 1))
-        assert isinstance(first, torch.Tensor)
-        assert isinstance(second, torch.Tensor)
-        lines.append(f"{first.double().sum().item().hex()} {second.sum().item().hex()}")
+        first, second = torch.zeros(1 + 37 * index), torch.zeros(5, 3, dtype=torch.float64)
+        for generator in generators:  # x + 0 is x: the sum begins with the first process
+            first += torch.randn(first.shape, generator=generator)
+            second += torch.randn(second.shape, generator=generator, dtype=torch.float64)
+        lines.append(" ".join(float(part.double().sum()).hex() for part in (first, second)))
     return lines
 
 

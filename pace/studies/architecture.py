@@ -21,8 +21,8 @@ from pace.runs.files import write_figure
 ROOT = Path(pace.__file__).parent
 #: Files beside the rooms that are no part of the picture: the package itself, and the list of commands that moved.
 LEFT_OUT = ("__init__", "__main__", "moved")
-WIDTH, HEIGHT, GAP = 9.0, 0.66, 0.36  # inches: of the picture; of a row, and the space between two
-BOX = 2.8  # inches: width of a box in a row of several
+HEIGHT, GAP = 0.66, 0.36  # inches: of a row, and the space between two
+BOX, BESIDE = 2.8, 0.2  # inches: width of a box in a row of several, and the space between three and more
 WIDE = 4.6  # of one that is alone in its row
 LETTERS = 14.5  # of a room's description in an inch
 LINES = 2  # of it in a box
@@ -122,7 +122,7 @@ def arrange(rooms: Mapping[str, Room]) -> list[tuple[str, ...]]:
     pairs = arrows(rooms)
 
     def cost(chosen: Sequence[Sequence[str]]) -> tuple[int, float]:
-        x = {name: place for row in chosen for name, place in zip(row, _places(len(row)), strict=True)}
+        x = {name: place for row in chosen for name, place in zip(row, _places(len(row), 0.0), strict=True)}
         crossed = sum(
             (x[a] - x[c]) * (x[b] - x[d]) < 0
             for (a, b), (c, d) in combinations(pairs, 2)
@@ -133,13 +133,10 @@ def arrange(rooms: Mapping[str, Room]) -> list[tuple[str, ...]]:
     return list(min(product(*(permutations(row) for row in rows)), key=cost))
 
 
-def _places(count: int) -> list[float]:
+def _places(count: int, middle: float) -> list[float]:
     """Middles of so many boxes in a row, inches."""
-    return (
-        [WIDTH * (i + 0.5) / count for i in range(count)]
-        if count > 2
-        else [WIDTH / 2 + (i - (count - 1) / 2) * (BOX + 0.5) for i in range(count)]
-    )
+    apart = BOX + (BESIDE if count > 2 else 0.5)
+    return [middle + (i - (count - 1) / 2) * apart for i in range(count)]
 
 
 def described(rooms: Mapping[str, Room]) -> str:
@@ -151,14 +148,15 @@ def draw(rooms: Mapping[str, Room]) -> Figure:
     """The picture."""
     rows = arrange(rooms)
     height = len(rows) * (HEIGHT + GAP) + 0.2
-    figure = Figure(figsize=(WIDTH, height))
+    width = BESIDE + max(3, *(len(row) for row in rows)) * (BOX + BESIDE)
+    figure = Figure(figsize=(width, height))
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    axes.set(xlim=(0.0, WIDTH), ylim=(0.0, height))
+    axes.set(xlim=(0.0, width), ylim=(0.0, height))
     axes.axis("off")
     middles, widths = {}, {}
     for i, row in enumerate(rows):
         y = 0.12 + i * (HEIGHT + GAP) + HEIGHT / 2
-        for name, x in zip(row, _places(len(row)), strict=True):
+        for name, x in zip(row, _places(len(row), width / 2), strict=True):
             middles[name], widths[name] = (x, y), WIDE if len(row) == 1 else BOX
             _box(axes, rooms[name], x, y, widths[name], SHADES[min(i // 2, len(SHADES) - 1)])
     for upper, lower in arrows(rooms):
@@ -166,7 +164,7 @@ def draw(rooms: Mapping[str, Room]) -> Figure:
     note = (
         "An arrow: imports. A room may also import what lies further down its arrows. Commands may import every room."
     )
-    axes.text(WIDTH / 2, height - 0.2, note, ha="center", va="center", size=9.5, color="#444444")
+    axes.text(width / 2, height - 0.2, note, ha="center", va="center", size=9.5, color="#444444")
     return figure
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from omegaconf import OmegaConf
 
-from pace.config import commands
+from pace.config import commands, page
 from pace.config.base import ConfigError, compose, parse
 from pace.config.limits import first_outside
 from tests.config.test_examples import places, put
@@ -17,9 +17,11 @@ from tests.helpers.examples import assert_one_line, check, counts_of, st, wrong_
 
 COMMANDS = {
     "evaluate": (commands.EvaluateConfig, ["run=any", "num_worlds=4"]),
-    "play": (commands.PlayConfig, ["run=any"]),
+    "play": (page.PlayConfig, ["run=any"]),
+    "watch": (page.WatchConfig, ["run=any"]),
     "compare": (commands.CompareConfig, ["runs=[a,b]", "num_worlds=4"]),
     "export": (commands.ExportConfig, ["run=any"]),
+    "retrace": (commands.RetraceConfig, ["policy=any", "log=any"]),
     "ablate": (commands.AblateConfig, []),
     "studies": (commands.StudiesConfig, []),
 }
@@ -100,6 +102,8 @@ ZERO = {
         "torque_slack", "hit", "success",
     },
     "play": {"seed"},
+    "watch": {"seed"},
+    "retrace": set(),
     "compare": {"seed", "warmup_serves"},
     "export": {"seed"},
     "ablate": {"seeds"},
