@@ -28,7 +28,7 @@ from pace.rl.agent import Agent, RunningNorm
 from pace.rl.ppo import PPO
 from pace.rl.rollout import Rollout, RolloutError
 from pace.rl.trainer import Trainer, restarts_worlds
-from pace.runs.checkpoint import flatten_tensors, load_checkpoint
+from pace.runs.checkpoint import CheckpointError, export_weights, flatten_tensors, load_checkpoint, save_checkpoint
 from pace.runs.metrics import read_metrics
 from tests.helpers.algo import CPU, IN_SAMPLES, small_algo
 from tests.helpers.dummy import DummyTask
@@ -306,6 +306,21 @@ def test_seeds_differ_between_processes_and_rank_0_keeps_the_configured_one() ->
     assert seeds[4] == 2
 
 
+def assert_same_learner(second: Trainer, first: Trainer) -> None:
+    """Counters, weights, and the state of the algorithm and of the regression, bit for bit."""
+    assert (second.updates, second.samples) == (first.updates, first.samples)
+    states: list[dict[str, Tensor]] = []
+    for trainer in (second, first):
+        saved, found = trainer.checkpoint(), dict[str, Tensor]()
+        assert saved.training is not None
+        parts = {part: saved.training[part] for part in ("algorithm", "regression")}
+        flatten_tensors({"weights": saved.weights, **parts}, "", found)
+        states.append(found)
+    assert states[0].keys() == states[1].keys()
+    assert len(states[0]) > 50
+    assert all(torch.equal(states[0][name], states[1][name]) for name in states[0])
+
+
 def test_another_number_of_processes_resumes_what_was_learned() -> None:
     config = load_train_config(["num_worlds=8", "tensorboard=false", "progress=false", "algo.std_floor=0.0"])
     first, second = (Trainer(config, DummyTask(8), PredictorNetwork(config.predictor), None) for _ in range(2))
@@ -320,18 +335,24 @@ def test_another_number_of_processes_resumes_what_was_learned() -> None:
     second.resume(saved)
     saved.training["processes"] = [{"env": "of worlds on a GPU", "random_cuda": played[0]["random"]}]
     second.resume(saved)
-    assert (second.updates, second.samples) == (1, first.samples)
-    again = second.checkpoint()
-    for part, tensors in saved.weights.items():
-        assert all(torch.equal(tensor, again.weights[part][name]) for name, tensor in tensors.items())
-    assert again.training is not None
-    before: dict[str, Tensor] = {}
-    after: dict[str, Tensor] = {}
-    for state, found in ((saved.training, before), (again.training, after)):
-        flatten_tensors({part: state[part] for part in ("algorithm", "regression")}, "", found)
-    assert before.keys() == after.keys()
-    assert all(torch.equal(before[name], after[name]) for name in before)
+    assert_same_learner(second, first)
     second.update()
+
+
+def test_a_kept_training_is_resumed_on_another_machine(tmp_path: Path) -> None:
+    config = load_train_config(["num_worlds=8", "tensorboard=false", "progress=false", "algo.std_floor=0.0"])
+    first, second = (Trainer(config, DummyTask(8), PredictorNetwork(config.predictor), None) for _ in range(2))
+    for _ in range(3):
+        first.update()
+    save_checkpoint(tmp_path / "run", first.checkpoint())
+    kept = load_checkpoint(export_weights(tmp_path / "run", tmp_path / "kept", training=True))
+    assert restarts_worlds(kept, ProcessGroup(), CPU)
+    second.resume(kept)
+    assert_same_learner(second, first)
+    second.update()
+    export_weights(tmp_path / "kept", tmp_path / "done")
+    with pytest.raises(CheckpointError, match="weights only: its training cannot be resumed"):
+        export_weights(tmp_path / "done", tmp_path / "again", training=True)
 
 
 # --- the command --------------------------------------------------------------------------------------------------

@@ -233,6 +233,7 @@ class KeepConfig:
     out: str | None
     evaluation: str | None  # folder that pace evaluate wrote
     notes: str | None  # Markdown file
+    training: bool  # whether the folder can be resumed
 
     def __post_init__(self) -> None:
         require(self.run is not None, "which run? give its folder or a checkpoint, and the folder to write")

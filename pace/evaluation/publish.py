@@ -1,8 +1,8 @@
 """Publishing a policy: a folder small enough for a repository, with the policy, its training and its evaluation.
 
-It holds the weights (float32) and the configuration of a run's newest checkpoint, or of a checkpoint, without the
-training state; beside them the main columns of the run's metrics, its learning curve, the tables and figures of an
-evaluation and of a sweep, and a model card (README.md).
+It holds the weights (float32) and the configuration of a run's newest checkpoint, or of a checkpoint, and the training
+state only if that is asked for; beside them the main columns of the run's metrics, its learning curve, the tables and
+figures of an evaluation and of a sweep, and a model card (README.md).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pace.config.base import parse
 from pace.config.commands import KeepConfig
 from pace.evaluation.card import CARD, FIRST_ROW, card
 from pace.rl.policies import locate
-from pace.runs.checkpoint import META, WEIGHTS, CheckpointError, export_weights, find_checkpoint
+from pace.runs.checkpoint import META, TRAINING, WEIGHTS, CheckpointError, export_weights, find_checkpoint
 from pace.runs.checkpoint_folders import FOLDER
 from pace.runs.files import write_whole
 from pace.runs.metrics import write_slim
@@ -31,7 +31,7 @@ EVALUATION_FILES = ("evaluation.json", "evaluation.md", "evaluation.csv")
 EVALUATION_FILES += ("strike_map.png", "landing_map.png", "by_ball.png")
 SWEEP_FILES = ("sweep.json", "sweep.png")
 #: All files that this module writes into a folder; it leaves other files alone.
-FILES = (META, WEIGHTS, METRICS, CARD, *RUN_FILES, *EVALUATION_FILES, *SWEEP_FILES)
+FILES = (META, WEIGHTS, TRAINING, METRICS, CARD, *RUN_FILES, *EVALUATION_FILES, *SWEEP_FILES)
 
 
 class KeepError(RuntimeError):
@@ -46,15 +46,19 @@ def keep_from_config(composed: DictConfig) -> None:
     try:
         notes = Path(config.notes).read_text(encoding="utf-8") if config.notes else ""
         evaluation = Path(config.evaluation) if config.evaluation else None
-        files = keep(locate(config.run), Path(config.out), evaluation, notes)
+        files = keep(locate(config.run), Path(config.out), evaluation, notes, config.training)
     except (OSError, UnicodeDecodeError) as error:
         raise KeepError(str(error)) from error
     for file in files:
         print(f"wrote {file} ({file.stat().st_size / 1024:.0f} KiB)")
 
 
-def keep(run: Path, folder: Path, evaluation: Path | None = None, notes: str = "") -> list[Path]:
+def keep(
+    run: Path, folder: Path, evaluation: Path | None = None, notes: str = "", training: bool = False
+) -> list[Path]:
     """Publish ``run`` and its ``evaluation`` as ``folder``, with ``notes`` in the card; returns the files written.
+
+    With ``training`` the run can be resumed from the folder, on any machine, in worlds that start from scratch.
 
     The folder appears when it is complete. An existing published policy is replaced; files in it that this function
     did not write stay. What a kill has left of an earlier call beside ``folder`` is finished or undone.
@@ -68,7 +72,7 @@ def keep(run: Path, folder: Path, evaluation: Path | None = None, notes: str = "
         raise CheckpointError(f"{evaluation} holds no evaluation.json: give a folder that pace evaluate wrote")
     require_own(folder, run, checkpoint)
     with replaced(folder) as fresh:  # the card is headed by its name
-        written = write_policy(fresh, checkpoint, evaluation, notes)
+        written = write_policy(fresh, checkpoint, evaluation, notes, training)
         if folder.is_dir():
             copy_others(folder, fresh)
     return [folder / name for name in written]
@@ -104,9 +108,9 @@ def is_published(folder: Path) -> bool:
     return isinstance(meta, dict) and "config" in meta and meta.get("training") is None
 
 
-def write_policy(folder: Path, checkpoint: Path, evaluation: Path | None, notes: str) -> list[str]:
+def write_policy(folder: Path, checkpoint: Path, evaluation: Path | None, notes: str, training: bool) -> list[str]:
     """Write all files of a published policy into the new ``folder``; returns their names."""
-    export_weights(checkpoint, folder)
+    export_weights(checkpoint, folder, training)
     of_a_run = checkpoint.parent.name == FOLDER  # else of a published policy, whose metrics are short already
     run = checkpoint.parent.parent if of_a_run else checkpoint
     sources = [run / name for name in RUN_FILES]

@@ -24,7 +24,7 @@ from pace.rl.plan import Plan
 from pace.rl.recovery import Recovery
 from pace.rl.rollout import TrainableTask
 from pace.rl.update import Update
-from pace.runs.checkpoint import Checkpoint, CheckpointError, load_weights
+from pace.runs.checkpoint import PROCESSES, Checkpoint, CheckpointError, load_weights
 from pace.runs.interrupt import StopRequest
 from pace.runs.learning_curve import plot_learning_curve
 from pace.runs.progress import Progress
@@ -241,7 +241,7 @@ class Trainer:
             training={
                 LEARNER: self.algorithm.state_dict(),
                 "regression": self.regression.state_dict(),
-                "processes": self.group.gather(own),
+                PROCESSES: self.group.gather(own),
             },
         )
 
@@ -282,7 +282,7 @@ class Trainer:
             self.algorithm.load_state_dict(state[LEARNER if LEARNER in state else OLD_LEARNER])
             self.regression.load_state_dict(state["regression"])
             if not restarts_worlds(checkpoint, self.group, self.device):
-                self._resume_worlds(state["processes"][self.group.rank])
+                self._resume_worlds(state[PROCESSES][self.group.rank])
         except (KeyError, ValueError, RuntimeError) as error:
             raise CheckpointError(f"{checkpoint.path} does not fit this configuration: {error}") from error
         self.updates, self.samples = int(checkpoint.counters["updates"]), int(checkpoint.counters["samples"])
@@ -309,4 +309,4 @@ def device_type_of(checkpoint: Checkpoint) -> str:
 
 def _processes(checkpoint: Checkpoint) -> list[dict[str, Any]]:
     """The saved state of each process of a checkpoint's run; empty if it holds weights only."""
-    return checkpoint.training["processes"] if checkpoint.training else []
+    return checkpoint.training[PROCESSES] if checkpoint.training else []

@@ -26,6 +26,7 @@ from pace.runs.checkpoint_folders import META, TRAINING, WEIGHTS, CheckpointErro
 from pace.runs.files import reason
 
 TENSOR_MARK = "__tensor__"
+PROCESSES = "processes"  # part of the training state: the worlds and random numbers of each process of the run
 
 
 @dataclass
@@ -242,17 +243,27 @@ RUN_KEYS: dict[str, Any] = {
 }  # fmt: skip
 
 
-def export_weights(path: str | Path, folder: str | Path) -> Path:
-    """Copy a checkpoint's weights and configuration without its training state, for ``pretrained/``.
+def export_weights(path: str | Path, folder: str | Path, training: bool = False) -> Path:
+    """Copy a checkpoint's weights and configuration, for ``pretrained/``; with ``training`` also what the algorithm and
+    the predictor's regression resume from, but not the worlds, which then start from scratch.
 
     Folders, threads and CUDA graphs of the training machine are left out of the configuration.
+
+    Errors: :class:`CheckpointError` if there is no such state.
     """
-    checkpoint = load_checkpoint(path, weights_only=True)
-    slim = {part: {k: _single(v) for k, v in tensors.items()} for part, tensors in checkpoint.weights.items()}
+    checkpoint = load_checkpoint(path, weights_only=not training)
+    if training and checkpoint.training is None:
+        raise CheckpointError(f"{checkpoint.path} holds weights only: its training cannot be resumed")
+    state = {**checkpoint.training, PROCESSES: []} if checkpoint.training is not None else None
+    kept = checkpoint.weights if training else _all_single(checkpoint.weights)
     config = checkpoint.config | {key: value for key, value in RUN_KEYS.items() if key in checkpoint.config}
     if "engine" in config:
         config["engine"] = config["engine"] | {"name": "auto", "threads": 0, "graph": "auto"}
-    return save_checkpoint(Path(folder), Checkpoint(config, checkpoint.counters, slim, None))
+    return save_checkpoint(Path(folder), Checkpoint(config, checkpoint.counters, kept, state))
+
+
+def _all_single(weights: dict[str, dict[str, Tensor]]) -> dict[str, dict[str, Tensor]]:
+    return {part: {name: _single(tensor) for name, tensor in tensors.items()} for part, tensors in weights.items()}
 
 
 def _single(tensor: Tensor) -> Tensor:
