@@ -22,7 +22,7 @@ ROOT = Path(pace.__file__).parent
 #: Files beside the rooms that are no part of the picture: the package itself, and the list of commands that moved.
 LEFT_OUT = ("__init__", "__main__", "moved")
 HEIGHT, GAP = 0.66, 0.36  # inches: of a row, and the space between two
-BOX, BESIDE = 2.8, 0.2  # inches: width of a box in a row of several, and the space between three and more
+BOX, BESIDE = 2.8, 0.12  # inches: width of a box in a row of several, and the space between three and more
 WIDE = 4.6  # of one that is alone in its row
 LETTERS = 14.5  # of a room's description in an inch
 LINES = 2  # of it in a box
