@@ -7,7 +7,7 @@ ARGS ?=
 WORKERS ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help train test test-fast test-long gpu lint bench venv lock clean
+.PHONY: help train test test-fast test-long gpu lint bench docs wheel venv lock clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## ?/\1\t/' | expand -t 12
@@ -34,6 +34,13 @@ lint: venv  ## ruff and pyright
 
 bench: venv  ## measure speed and memory: python -m pace.bench $(ARGS)
 	$(BIN)/python -m pace.bench $(ARGS)
+
+docs: export NO_MKDOCS_2_WARNING := 1
+docs: venv  ## build the documentation as a site in build/site; a warning is an error
+	$(BIN)/python -m mkdocs build --strict $(ARGS)
+
+wheel: venv  ## build the wheel into dist/
+	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
 
 # The stamp holds what was installed; it is compared by content, since a checkout changes the times of files.
 # A CPU build of torch comes first, if pip is told where one lies: of files without a hash in their address pip takes none
@@ -67,14 +74,16 @@ venv:  ## make or renew .venv from requirements.lock
 
 # Resolves pyproject.toml anew for all platforms, with the hashes of all files of a release; torch stays at the version
 # pinned below. What PyPI's torch for Linux needs besides, for a GPU, is in a lock of its own: a CPU build does without.
+# The extra wandb is left out: with it come twenty packages that no run needs.
 lock: TORCH := 2.13.0
+lock: LOCKED_EXTRAS = $(shell sed -n '/optional-dependencies/,/^$$/s/^\([a-z]*\) = .*/--extra \1/p' pyproject.toml | grep -v wandb)
 lock: CPU_WHEELS ?= $(wildcard /opt/wheels/torch-$(TORCH)+cpu-*.whl)
 lock:  ## renew requirements.lock and requirements-cuda.lock
 	@set -e; scratch=$$(mktemp -d); trap 'rm -rf "$$scratch"' EXIT; \
 	python3 -m venv $$scratch; $$scratch/bin/pip install --quiet uv; \
 	echo "torch==$(TORCH)" > $$scratch/pins; \
 	$$scratch/bin/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate \
-	  --all-extras --constraint $$scratch/pins $(LOCK_ARGS) pyproject.toml > $$scratch/all; \
+	  $(LOCKED_EXTRAS) --constraint $$scratch/pins $(LOCK_ARGS) pyproject.toml > $$scratch/all; \
 	for wheel in $(CPU_WHEELS); do \
 	  hash=$$(sha256sum "$$wheel" | cut -d ' ' -f 1); \
 	  sed -i "s|^torch==.*|&\n    --hash=sha256:$$hash \\\\|" $$scratch/all; \

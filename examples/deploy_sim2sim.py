@@ -1,20 +1,20 @@
 """Play an exported policy in plain MuJoCo: the sim-to-sim test, and the starting point for a real robot.
 
-    python -m pace.deploy runs/my_run out=.               # writes policy.onnx
-    python examples/deploy_sim2sim.py policy.onnx         # 50 serves, prints their outcomes
+    pace export runs/my_run out=robot                           # writes robot/policy.onnx and its contract
+    python examples/deploy_sim2sim.py robot/policy.onnx         # 50 serves, prints their outcomes
 
-Needs onnxruntime, mujoco and numpy, and nothing of PACE but the MJCF in pace/sim/assets. One core is enough.
+Needs onnxruntime, mujoco and numpy, and of PACE the MJCF in pace/sim/assets and the reference player. One core is
+enough.
 
-:class:`Controller` is what a robot runs: it calls the file with the current readings and with the state that the last
-call gave. The rest stands in for the world: :class:`Robot` is MuJoCo with the joints' position controllers and
-noisy, late sensors, :class:`Ball` a small model of flight and rebounds of its own. World frame: origin on the floor
-below the table's centre, x towards the opponent, y to the robot's left, z up. SI units.
+:class:`pace.deploy.player.Controller` is what a robot runs: it calls the file with the current readings and with the
+state that the last call gave. The rest stands in for the world: :class:`Robot` is MuJoCo with the joints' position
+controllers and noisy, late sensors, :class:`Ball` a small model of flight and rebounds of its own. World frame: origin
+on the floor below the table's centre, x towards the opponent, y to the robot's left, z up. SI units.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from collections import Counter, deque
@@ -24,11 +24,14 @@ from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
-import onnxruntime
-import onnxruntime.capi.onnxruntime_pybind11_state as ort  # type: ignore[import-not-found]
 
-SCENE = Path(__file__).resolve().parent.parent / "pace" / "sim" / "assets" / "scene.xml"
-FORMAT = 5  # of the metadata that is understood here
+ROOT = Path(__file__).resolve().parent.parent
+if str(ROOT) not in sys.path:
+    sys.path.append(str(ROOT))  # so that it runs from a checkout in which nothing is installed
+
+from pace.deploy.player import Controller, Log  # noqa: E402
+
+SCENE = ROOT / "pace" / "sim" / "assets" / "scene.xml"
 GRAVITY = np.array([0.0, 0.0, -9.81])  # m/s^2
 PHYSICS_DT = 0.002  # s
 BALL_DT = 0.001  # s: a ball at 10 m/s moves by half its radius
@@ -44,71 +47,8 @@ SERVES = {  # m/s: vx, vy, vz (the paper's evaluation)
     "mixed": ((-6.5, -5.2), (-0.6, 0.2), (1.5, 1.9)),
 }
 
-#: Errors of onnxruntime for a file that it cannot read; they have no common class.
-UNREADABLE = (ort.NoSuchFile, ort.InvalidProtobuf, ort.InvalidGraph, ort.InvalidArgument, ort.NotImplemented, ort.Fail)
-
 Vector = np.ndarray
 Frame = dict[str, np.ndarray]
-
-
-class Controller:
-    """The exported policy: one call a control step, from the sensors' current readings to joint targets.
-
-    Attributes: ``meta`` the file's metadata, ``control_dt`` s between calls, ``outputs`` of the last call by name.
-    """
-
-    def __init__(self, file: str | Path) -> None:
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
-        self._session = onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
-        stored = self._session.get_modelmeta().custom_metadata_map
-        if "format" not in stored:
-            raise ValueError("no policy that PACE exported")
-        if stored["format"] != str(FORMAT):
-            raise ValueError(f"format {stored['format']}, not {FORMAT}: export it again with this version of PACE")
-        self.meta = {name: json.loads(value) for name, value in stored.items()}
-        self.control_dt = float(self.meta["control_dt"])
-        self.outputs: Frame = {}
-        self._names = [output.name for output in self._session.get_outputs()]
-        self.restart()
-
-    def restart(self) -> None:
-        """Start from scratch, without earlier returns: after a fall, with another paddle, not with every ball."""
-        self._state = np.zeros((1, self.meta["inputs"]["state"]["size"]), dtype=np.float32)
-
-    def __call__(self, readings: Mapping[str, Vector]) -> Vector:
-        """Joint targets (J,) rad, in the order of ``meta["joint_names"]``.
-
-        Args: readings: the sensed inputs by name (``meta["inputs"]`` describes them), each of its own size.
-
-        Errors: ``ValueError``, in one line, for a reading that is missing, unknown, of another size or not finite, and
-        for targets that are not finite. The state then stays that of the call before, so that the next one goes on.
-        """
-        sizes = {name: port["size"] for name, port in self.meta["inputs"].items() if name != "state"}
-        for name in sorted(sizes.keys() ^ readings.keys(), key=str):
-            raise ValueError(f"the reading {name} is {'missing' if name in sizes else 'no input of the file'}")
-        frame = {name: _reading(name, readings[name], size)[None] for name, size in sizes.items()}
-        values = self._session.run(self._names, frame | {"state": self._state})
-        outputs = {name: np.asarray(value)[0] for name, value in zip(self._names, values, strict=True)}
-        if not all(np.isfinite(value).all() for value in outputs.values()):
-            raise ValueError("the readings are beyond all sense: what follows from them is not finite")
-        self.outputs = outputs
-        self._state = outputs["state_next"][None]
-        return outputs["joint_target"]
-
-
-def _reading(name: str, value: object, size: int) -> Vector:
-    """``value`` as a float32 vector of ``size`` finite numbers. Errors: ``ValueError``."""
-    try:
-        with np.errstate(over="ignore"):  # becomes infinite, which is refused below
-            vector = np.asarray(value).astype(np.float32, casting="same_kind")
-    except (TypeError, ValueError):  # text, numbers of another kind, lists of different lengths
-        vector = np.empty(0, dtype=np.float32)
-    if vector.shape != (size,):
-        raise ValueError(f"the reading {name} must be a vector of {size} numbers")
-    if not np.isfinite(vector).all():
-        raise ValueError(f"the reading {name} is not finite")
-    return vector
 
 
 class Blade(NamedTuple):
@@ -457,8 +397,11 @@ class Match:
     Attributes: ``results`` outcome -> count, ``hits``, ``clock`` s played.
     """
 
-    def __init__(self, controller: Controller, robot: Robot, ball: Ball, serve: str, seed: int) -> None:
+    def __init__(
+        self, controller: Controller, robot: Robot, ball: Ball, serve: str, seed: int, log: Log | None = None
+    ) -> None:
         self.controller, self.robot, self.ball = controller, robot, ball
+        self._log, self._fresh = log, True
         self._ranges, self._random = SERVES[serve], np.random.default_rng(seed)
         self._rules: Mapping[str, float] = controller.meta["config"]["serve"]
         self.results: Counter[str] = Counter()
@@ -477,6 +420,7 @@ class Match:
             if not standing:
                 self.robot.reset(self.ball.position)
                 self.controller.restart()
+                self._fresh = True
             referee, standing = self._rally()
             self.hits += referee.hit
             self.results[referee.outcome or ("out" if referee.hit else "miss")] += 1
@@ -497,7 +441,11 @@ class Match:
         return referee, True
 
     def _control_step(self) -> list[Contact]:
-        target = self.controller(self.robot.sense())
+        readings = self.robot.sense()
+        target = self.controller(readings)
+        if self._log is not None:
+            self._log.add(self.clock, readings, target, self._fresh)
+        self._fresh = False
         contacts: list[Contact] = []
         struck: Contact | None = None
         for _ in range(round(self.controller.control_dt / PHYSICS_DT)):
@@ -529,23 +477,25 @@ def report(match: Match, seconds: float) -> str:
 def main() -> int:
     """Entry point; returns the exit status."""
     parser = argparse.ArgumentParser(description="Play an exported policy in plain MuJoCo.")
-    parser.add_argument("policy", type=Path, help="ONNX file of python -m pace.deploy")
+    parser.add_argument("policy", type=Path, help="policy.onnx of pace export, its contract beside it")
     parser.add_argument("--serves", type=int, default=50)
     parser.add_argument("--serve", choices=SERVES, default="mixed", help="serve range of the paper's evaluation")
     parser.add_argument("--noise", type=float, default=1.0, help="times the noise and delays of the training")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--log", type=Path, help="file to record readings and targets in, for pace retrace")
     parser.add_argument("--scene", type=Path, default=SCENE, help="MJCF of the table, beside that of the robot")
     options = parser.parse_args()
     if options.serves < 1 or options.seed < 0 or not 0.0 <= options.noise < float("inf"):
         parser.error("--serves must be at least 1, --seed and --noise not negative")
     try:
         controller = Controller(options.policy)
-    except (ValueError, *UNREADABLE) as error:
-        print(f"error: {options.policy} cannot be used: {str(error).splitlines()[0]}", file=sys.stderr)
+    except ValueError as error:
+        print(f"error: {options.policy} cannot be used: {error}", file=sys.stderr)
         return 1
     random = np.random.default_rng(options.seed)
     robot = Robot(controller.meta, options.scene, options.noise, random)
-    match = Match(controller, robot, Ball(controller.meta["config"]["ball"]), options.serve, options.seed)
+    log = Log(options.log, controller.sizes, len(controller.contract["joint_names"])) if options.log else None
+    match = Match(controller, robot, Ball(controller.meta["config"]["ball"]), options.serve, options.seed, log)
     ball = controller.meta["config"]["ball"]
     print(f"policy {controller.meta['source']}, serves {options.serve}, ball {ball['name']}", flush=True)
     started = time.process_time()
@@ -554,6 +504,9 @@ def main() -> int:
     except ValueError as error:  # of the controller
         print(f"error: {options.policy} cannot be played: {error}", file=sys.stderr)
         return 1
+    finally:
+        if log is not None:
+            log.close()
     print(report(match, time.process_time() - started))
     return 0
 

@@ -5,6 +5,7 @@ A notebook begins with ``pace.make_env`` and ``pace.load_policy``; ``python -m p
 
 from __future__ import annotations
 
+import os
 import sys
 from typing import TYPE_CHECKING
 
@@ -12,11 +13,14 @@ from pace.lazy import on_first_use
 from pace.moved import MovedCommands
 
 if TYPE_CHECKING:
+    from pace.rl.environment import make_env
     from pace.rl.policies import load_policy
-    from pace.task.env import make_env
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = ["load_policy", "make_env"]
 sys.meta_path.append(MovedCommands())
+# OpenMP reads it when torch is loaded. Its threads would spin while they wait for one another, and take the cores from
+# whoever shares them, a run's own too: beside other programs, one process does five times the steps if they sleep.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-__getattr__ = on_first_use(__name__, {"load_policy": "pace.rl.policies", "make_env": "pace.task.env"})
+__getattr__ = on_first_use(__name__, {"load_policy": "pace.rl.policies", "make_env": "pace.rl.environment"})

@@ -2,7 +2,8 @@
 
 Each process simulates separate worlds and holds the same networks. Gradients are averaged over the group, so the
 weights stay equal, bit for bit. Processes are started by :func:`process_group` on this machine, or by ``torchrun`` on
-one machine or several. Communication is torch.distributed: gloo between CPUs, nccl between GPUs.
+one machine or several. Communication is torch.distributed: gloo between CPUs, nccl between GPUs; sums of processes that
+:func:`process_group` starts go through memory that they share (:mod:`pace.exchange`).
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from torch import Tensor
 
 from pace.config.automatic import SHARE_OF_MEMORY, memory_needed
 from pace.cores import threads_of, usable_cores
+from pace.exchange import MOST, Exchange, Shared, nobody_failed
 from pace.memory import available_memory
 
 T = TypeVar("T")
@@ -31,6 +33,7 @@ T = TypeVar("T")
 WORLDS_PER_PROCESS = 256  # with fewer, the fixed cost of each operation outweighs what another process gains
 LOCAL_ADDRESS = "127.0.0.1"
 MEMBERSHIP = "PACE_PROCESS_GROUP"  # environment variable of a worker: its rank, the group's size, rank 0's port
+SHARED = "PACE_SHARED"  # likewise: the files of Shared that it inherits
 SECONDS_TO_END = 10.0  # for a worker after rank 0 is done
 RANK_0_IS_GONE = 3  # exit status of a worker
 SECONDS_TO_FAIL = 3.0  # between a lost connection and the end of the process behind it
@@ -48,8 +51,9 @@ class ProcessGroup:
     All processes of the group must call the collective methods in the same order.
     """
 
-    def __init__(self, rank: int = 0, size: int = 1) -> None:
+    def __init__(self, rank: int = 0, size: int = 1, exchange: Exchange | None = None) -> None:
         self.rank, self.size = rank, size
+        self._exchange = exchange
 
     @property
     def is_rank_0(self) -> bool:
@@ -75,11 +79,10 @@ class ProcessGroup:
             return lambda: None
         alone = len(tensors) == 1
         flat = tensors[0].view(-1) if alone else torch.cat([tensor.reshape(-1) for tensor in tensors])
-        work = dist.all_reduce(flat, async_op=True)
-        assert work is not None  # None is for processes outside the group
+        receive = self._sum_later(flat)
 
         def finish() -> None:
-            work.wait()
+            receive()
             parts = flat.div_(self.size).split([tensor.numel() for tensor in tensors])
             for tensor, part in () if alone else zip(tensors, parts, strict=True):
                 tensor.copy_(part.view_as(tensor))
@@ -89,8 +92,16 @@ class ProcessGroup:
     def all_reduce_sum_(self, tensor: Tensor) -> Tensor:
         """Replace ``tensor`` by its sum over the group, and return it."""
         if self.size > 1:
-            dist.all_reduce(tensor)
+            self._sum_later(tensor)()
         return tensor
+
+    def _sum_later(self, tensor: Tensor) -> Callable[[], object]:
+        """Send a tensor; calling the returned function replaces it by its sum over the group."""
+        if self._exchange is not None and self._exchange.takes(tensor):
+            return self._exchange.send(tensor)
+        work = dist.all_reduce(tensor, async_op=True)
+        assert work is not None  # None is for processes outside the group
+        return work.wait
 
     def broadcast_(self, tensors: Sequence[Tensor]) -> None:
         """Replace each tensor by that of rank 0."""
@@ -143,8 +154,9 @@ def process_group(size: int, device: torch.device, command: Sequence[str] | None
         rank, size, port = (int(part) for part in membership.split())
         store = dist.TCPStore(LOCAL_ADDRESS, port, is_master=False)
         store.set(f"here/{rank}", "")
+        shared = Shared.inherited(os.environ[SHARED]) if SHARED in os.environ else None
         with _connected(device, store=store, rank=rank, world_size=size):
-            yield ProcessGroup(rank, size)
+            yield ProcessGroup(rank, size, _exchange(shared, rank, size))
     elif under_torchrun():
         with _connected(device):
             yield ProcessGroup(dist.get_rank(), dist.get_world_size())
@@ -154,10 +166,17 @@ def process_group(size: int, device: torch.device, command: Sequence[str] | None
         threads = threads_of(size)
         torch.set_num_threads(threads)
         store = dist.TCPStore(LOCAL_ADDRESS, 0, is_master=True, wait_for_workers=False)
-        with _Workers(size, store.port, threads, command or this_command()) as workers:
+        shared = Shared.open(size) if size <= MOST else None
+        with _Workers(size, store.port, threads, command or this_command(), shared) as workers:
             workers.wait_for(store)
             with _connected(device, store=store, rank=0, world_size=size), workers.explaining():
-                yield ProcessGroup(0, size)
+                yield ProcessGroup(0, size, _exchange(shared, 0, size, workers.require_none_failed))
+
+
+def _exchange(
+    shared: Shared | None, rank: int, size: int, require_all: Callable[[], None] = nobody_failed
+) -> Exchange | None:
+    return None if shared is None else Exchange(rank, size, shared.memory, shared.pipes, require_all)
 
 
 def under_torchrun() -> bool:
@@ -202,16 +221,21 @@ def _connected(device: torch.device, **place: Any) -> Iterator[None]:
 class _Workers:
     """The other ranks, started by rank 0. They end with the block; their output goes to a file."""
 
-    def __init__(self, size: int, port: int, threads: int, command: Sequence[str]) -> None:
+    def __init__(self, size: int, port: int, threads: int, command: Sequence[str], shared: Shared | None) -> None:
         self._open = ExitStack()
+        files: list[int] = []
+        of_shared: dict[str, str] = {}
+        if shared is not None:
+            self._open.callback(shared.close)
+            files, of_shared = shared.numbers(), {SHARED: shared.describe()}
         self._logs: dict[int, IO[str]] = {}
         self._started: dict[int, subprocess.Popen[str]] = {}
         for rank in range(1, size):
             unnamed = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")  # noqa: SIM115  # the stack closes it
             log = self._open.enter_context(unnamed)
             self._logs[rank] = log
-            environment = {MEMBERSHIP: f"{rank} {size} {port}", "OMP_NUM_THREADS": str(threads)}
-            self._started[rank] = _start(command, log, environment)
+            environment = {MEMBERSHIP: f"{rank} {size} {port}", "OMP_NUM_THREADS": str(threads)} | of_shared
+            self._started[rank] = _start(command, log, environment, files)
 
     def __enter__(self) -> _Workers:
         return self
@@ -237,7 +261,7 @@ class _Workers:
         """Return when all have connected to ``store``."""
         for rank in self._started:
             while not store.check([f"here/{rank}"]):
-                self._require_none_failed(0.0)
+                self.require_none_failed()
                 time.sleep(POLL_SECONDS)
 
     @contextmanager
@@ -247,10 +271,10 @@ class _Workers:
             yield
         except RuntimeError as error:
             if type(error) in (RuntimeError, dist.DistBackendError, dist.DistNetworkError):  # not one of this project's
-                self._require_none_failed(SECONDS_TO_FAIL, error)
+                self.require_none_failed(SECONDS_TO_FAIL, error)
             raise
 
-    def _require_none_failed(self, patience: float, cause: Exception | None = None) -> None:
+    def require_none_failed(self, patience: float = 0.0, cause: Exception | None = None) -> None:
         """Errors: :class:`ProcessGroupError` when a worker has ended, or ends within ``patience`` seconds."""
         deadline = time.monotonic() + patience
         while True:
@@ -277,8 +301,11 @@ def this_command() -> list[str]:
     return [*(["-m", module.name] if module else [sys.argv[0]]), *sys.argv[1:]]
 
 
-def _start(command: Sequence[str], log: IO[str], environment: dict[str, str]) -> subprocess.Popen[str]:
-    """Start Python with ``command`` in its own process group: Ctrl-C then reaches only rank 0, which ends the run."""
+def _start(
+    command: Sequence[str], log: IO[str], environment: dict[str, str], files: Sequence[int]
+) -> subprocess.Popen[str]:
+    """Start Python with ``command``, which inherits ``files``, in its own process group: Ctrl-C then reaches only rank
+    0, which ends the run."""
     return subprocess.Popen(
         [sys.executable, *command],
         env=os.environ | environment,
@@ -286,5 +313,6 @@ def _start(command: Sequence[str], log: IO[str], environment: dict[str, str]) ->
         stdout=log,
         stderr=subprocess.STDOUT,
         process_group=0,
+        pass_fds=files,
         text=True,
     )

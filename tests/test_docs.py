@@ -9,13 +9,14 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+import pace
 from pace.command.table import COMMANDS, TRAIN_GROUPS
 from pace.config.names import choices
 from pace.moved import MOVED
 from pace.studies import architecture
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 NAME = re.compile(r"\bpace(?:\.\w+)+")
 ENTRY_POINTS = {"pace.reward_terms", "pace.observations", "pace.critic_observations", "pace.algorithms", "pace.engines"}
 NOT_NAMES = ENTRY_POINTS | {"pace.predictors"}
@@ -101,14 +102,36 @@ def test_the_port_tables_are_those_of_the_exported_file() -> None:
     assert rows["state"] == rows["state_next"] == ("S", "-")
 
 
-def test_the_readme_lists_commands_groups_and_folders() -> None:
+def test_the_readme_fits_and_lists_the_commands() -> None:
     text = (ROOT / "README.md").read_text()
     assert [name for name in COMMANDS if f"| `pace {name}" not in text] == []
+    assert len(text.splitlines()) <= 120
+    assert text.split("```")[1].split()[:2] == ["make", "train"]
+
+
+def test_the_page_on_architecture_lists_the_folders() -> None:
+    text = (ROOT / "docs" / "architecture.md").read_text()
     rooms = [name for name, room in architecture.read_rooms().items() if (ROOT / "pace" / name).is_dir()]
     assert [name for name in rooms if f"`pace/{name}/`" not in text] == []
+
+
+def test_the_page_on_configuration_lists_the_groups() -> None:
+    text = (ROOT / "docs" / "howto" / "configure.md").read_text()
     for group in TRAIN_GROUPS:
         listed = re.search(rf"^\| `{group}` \| ([^|]+) \|", text, re.MULTILINE)
         assert listed, group
         named = listed[1].strip().removesuffix(", ...").split(", ")
         assert set(named) <= set(choices(group)), group
         assert "..." in listed[1] or set(named) == set(choices(group)), group
+
+
+def test_the_moving_picture_is_small_and_moves() -> None:
+    file = ROOT / "docs" / "results" / "figures" / "campaign.webp"
+    assert file.stat().st_size < 3e6
+    with Image.open(file) as picture:
+        assert picture.n_frames > 50  # type: ignore[attr-defined]
+
+
+def test_the_version_is_that_of_the_changelog_and_the_citation() -> None:
+    assert f"\n## {pace.__version__}\n" in (ROOT / "CHANGELOG.md").read_text()
+    assert f"\nversion: {pace.__version__}\n" in (ROOT / "CITATION.cff").read_text()

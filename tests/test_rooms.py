@@ -20,7 +20,7 @@ ORDER = (
     ("config",),
     ("moved", "lazy", "cgroups"),
     ("cores", "memory"),
-    ("devices",),
+    ("devices", "exchange"),
     ("arrays", "distributed", "command"),
     ("runs",),
     ("sim.robot_spec",),  # what is known of a robot without simulating it
@@ -31,6 +31,7 @@ ORDER = (
     ("onboard",),
     ("task",),
     ("rl",),
+    ("interfaces",),
     ("evaluation",),
     ("deploy",),
     ("viewer",),

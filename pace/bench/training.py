@@ -48,7 +48,7 @@ def training_run(num_worlds: int, updates: int, overrides: list[str]) -> tuple[f
     Returns its control steps a second after the first updates (NaN for a run that is too short), and the largest
     resident memory of its processes together in MiB. Errors: :class:`BenchError` when the command fails.
     """
-    kept = without(overrides, "num_worlds", "samples", "minutes", "out", "progress", "tensorboard")
+    kept = without(overrides, "num_worlds", "samples", "minutes", "out", "progress", "tensorboard", "logger")
     steps = load_train_config(kept).algo.steps
     with tempfile.TemporaryDirectory() as folder:
         settings = {

@@ -15,7 +15,7 @@ from pace.config.names import check_renamed, split_override
 HYDRA_OPTIONS = ("--cfg", "-c", "--info", "-i", "--package", "-p", "--config-name", "-cn", "--config-dir", "-cd")
 
 #: Keys whose value is a path, of any command.
-PATHS = ("out", "run", "resume", "init_from", "predictor_from", "video", "evaluation", "notes", "figure")
+PATHS = ("out", "run", "resume", "init_from", "predictor_from", "video", "evaluation", "notes", "figure", "log")
 
 #: Tables of the configuration with keys of the users' own.
 OPEN_TABLES = ("reward.terms.", "observation.estimates.")
@@ -149,8 +149,9 @@ def check_keys(name: str, command: Command, arguments: Sequence[str]) -> None:
     for argument in plain_overrides(arguments):
         key, _ = split_override(argument)
         root = key.replace("/", ".").replace("@", ".").split(".")[0]
-        if key in command.refused:
-            raise ConfigError(f"{key}= is no key of pace {name}: {command.refused[key]}")
+        for refused, why in command.refused.items():
+            if key == refused or ("." in refused and key.startswith(f"{refused}.")):
+                raise ConfigError(f"{key}= is no key of pace {name}: {why}")
         if "=" not in argument and not argument.startswith("~"):
             raise ConfigError(f"'{argument}' is no key=value (--help lists the keys)")
         if root in (*known, "hydra") or (more_groups and argument.startswith("+")):

@@ -22,6 +22,7 @@ from pace.command.help import command_help
 from pace.command.table import COMMANDS, Command
 from pace.config import plugins
 from pace.config.base import ConfigError, also_from, compose, config_dir, meant
+from pace.config.extras import cure
 from pace.config.names import check_choice, split_override
 from pace.cores import core_set, usable_cores
 
@@ -55,6 +56,13 @@ def run_command(name: str) -> int:
     """
     if isinstance(sys.stdout, TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # names of files in letters that the terminal does not have
+    try:
+        return _started(name)
+    except KeyboardInterrupt:
+        return complain("interrupted", EXIT_INTERRUPTED)
+
+
+def _started(name: str) -> int:
     try:
         if {"-h", "--help"} & set(sys.argv[1:]):
             return show(command_help(name, _topic(sys.argv[1:])))
@@ -148,7 +156,7 @@ def _work(command: Command, config: DictConfig) -> int:
     except ModuleNotFoundError as error:
         if not command.extra or (error.name or "").startswith("pace"):
             raise
-        return complain(f"{error}: pip install 'pace-table-tennis[{command.extra}]'", EXIT_FAILED)
+        return complain(f"{error}: {cure(command.extra)}", EXIT_FAILED)
     except ConfigError as error:
         return complain(str(error), EXIT_USAGE)
     try:

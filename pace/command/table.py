@@ -11,6 +11,10 @@ TRAIN_GROUPS = (
     "robot", "ball", "serve", "reset", "reward", "randomization", "sensing", "observation", "engine", "algo",
     "predictor", "experiment",
 )  # fmt: skip
+#: Of commands that only play: no reward is computed there.
+NO_REWARD: dict[str, str] = dict.fromkeys(
+    ("reward.terms", "reward.scale"), "no reward is computed; pace train and pace watch do that"
+)
 CHECKPOINT_ERROR = "pace.runs.checkpoint:CheckpointError"
 SAVED_RUN = (
     "RUN is a run folder, a checkpoint in one, or the name of a published policy (campaign). The task is the one saved "
@@ -80,7 +84,7 @@ COMMANDS = {
         groups=(*TASK_GROUPS, "engine"),
         training_keys=TASK_VALUES,
         collected=True,
-        refused={"serve": "rows= names the serve ranges, such as rows=[short]"},
+        refused={"serve": "rows= names the serve ranges, such as rows=[short]", **NO_REWARD},
     ),
     "play": Command(
         module="pace.viewer",
@@ -100,9 +104,27 @@ COMMANDS = {
             "pretrained/pace",
             "pretrained/pace ball=paper serve=short port=9000",
             "runs/2026-01-01_pace --video out.mp4 seconds=30 speed=0.25",
+            "policy=zero serve=short        # the task, before there is a policy: also policy=random",
         ),
         positional=("run",),
         options=("video",),
+        groups=(*TASK_GROUPS, "engine"),
+        training_keys=TASK_VALUES,
+        collected=True,
+        refused=NO_REWARD,
+    ),
+    "watch": Command(
+        module="pace.viewer.watch",
+        work="pace.viewer.following:watch_from_config",
+        failures=(CHECKPOINT_ERROR, "pace.viewer.server:PageError"),
+        extra="viewer",
+        config="watch",
+        summary="the newest policy of a run that trains, on a live page with its reward terms",
+        usage="RUN [key=value ...]",
+        about="The page of pace play, which takes each new checkpoint of the run when it is written. Start it in a "
+        "second terminal; it waits for the first checkpoint.",
+        examples=("runs/2026-01-01_pace", "runs/2026-01-01_pace port=9000 serve=short rewards=false"),
+        positional=("run",),
         groups=(*TASK_GROUPS, "engine"),
         training_keys=TASK_VALUES,
         collected=True,
@@ -119,6 +141,19 @@ COMMANDS = {
         "policy.onnx into the folder out.",
         examples=("pretrained/pace", "runs/2026-01-01_pace out=runs/robot"),
         positional=("run",),
+    ),
+    "retrace": Command(
+        module="pace.deploy.retrace",
+        work="pace.deploy.trace:retrace_from_config",
+        failures=("pace.deploy.trace:RetraceError",),
+        extra="export",
+        config="retrace",
+        summary="a robot's log through the exported file: where its targets part from the recorded ones",
+        usage="POLICY LOG [key=value ...]",
+        about="POLICY is policy.onnx or its folder, LOG what the robot has recorded (docs/robot.md). Prints the first "
+        "step at which they part, and what was unusual: late steps, old frames, readings that the policy refuses.",
+        examples=("robot/policy.onnx robot/monday.log", "robot robot/monday.log tolerance=1e-3 out=runs/monday"),
+        positional=("policy", "log"),
     ),
     "ablate": Command(
         module="pace.studies.ablate",
@@ -141,6 +176,7 @@ COMMANDS = {
             "curriculum",
             "checkpoint_minutes",
             "tensorboard",
+            "logger",
             "plugins",
         ),
         collected=True,
@@ -165,7 +201,7 @@ COMMANDS = {
         groups=(*TASK_GROUPS, "engine"),
         training_keys=TASK_VALUES,
         collected=True,
-        refused={"serve": "rows= names the serve ranges, such as rows=[short]"},
+        refused={"serve": "rows= names the serve ranges, such as rows=[short]", **NO_REWARD},
     ),
     "keep": Command(
         module="pace.evaluation.keep",
@@ -229,6 +265,7 @@ COMMANDS = {
             "checkpoint_minutes",
             "out",
             "tensorboard",
+            "logger",
             "progress",
             "plugins",
         ),

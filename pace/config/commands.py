@@ -1,4 +1,4 @@
-"""The other commands: bench, evaluate, export, play, ablate, compare, keep, validate, studies."""
+"""The other commands: bench, evaluate, export, retrace, ablate, compare, keep, validate, studies."""
 
 from __future__ import annotations
 
@@ -146,33 +146,20 @@ class ExportConfig:
 
 
 @dataclass
-class PlayConfig:
-    """``python -m pace.viewer``: the policy, and the page or the video."""
+class RetraceConfig:
+    """``python -m pace.deploy.retrace``: the exported policy, the log, and what counts as a difference."""
 
-    run: str | None
-    host: str
-    port: int
-    speed: float  # of time; 1: real time
-    seed: int
-    physics_dt: float  # s
-    overrides: list[str]  # of the saved task
-    video: str | None
-    seconds: float  # of play
-    width: int  # pixels of each view
-    height: int
-    fps: int
-    plugins: list[str] = field(default_factory=list)  # modules that add what the saved task needs
+    policy: str | None
+    log: str | None
+    tolerance: float  # rad
+    late: float  # share of control_dt
+    out: str | None
 
     def __post_init__(self) -> None:
-        require(self.run is not None, "which run? give its folder, a checkpoint or pretrained/<name>")
-        require(0 < self.speed <= 1, f"speed must lie in (0, 1], got {self.speed}")
-        require(1 <= self.port <= 65535, f"port must lie in 1 to 65535, got {self.port}")
-        require(self.video is None or self.video.endswith(".mp4"), f"video must end in .mp4, got {self.video}")
-        for name in ("seconds", "fps"):
+        require(self.policy is not None, "which policy? give policy.onnx of pace export, then the log")
+        require(self.log is not None, "which log? give the file that the robot has recorded, after policy.onnx")
+        for name in ("tolerance", "late"):
             require(getattr(self, name) > 0, f"{name} must be positive, got {getattr(self, name)}")
-        for name in ("width", "height"):
-            value = getattr(self, name)
-            require(value > 0 and value % 2 == 0, f"{name} must be an even number of pixels, got {value}")
 
 
 @dataclass

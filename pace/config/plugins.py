@@ -36,10 +36,11 @@ class Registry(dict[str, T], Generic[T]):
     """Objects of one kind by name; ``registry[name]`` finds those from outside, too.
 
     Args:
-        kind, where: name of the kind and prefix of its names, for messages.
+        kind: its name, for messages.
         group: of the entry points.
         accept: checks, or converts, an object from outside; errors: ``TypeError`` that says what is expected.
         members: those of the package.
+        where: prefix of its names, for messages.
 
     Errors of ``registry[name]``: :class:`ConfigError` for an unknown name, a module that was not named or that cannot
     be imported, and an object of another kind.

@@ -123,6 +123,7 @@ class TrainConfig(TaskConfig, Completed):
     plan: PlanConfig = field(default_factory=PlanConfig, kw_only=True)
     judge: JudgeConfig = field(default_factory=JudgeConfig, kw_only=True)
     plugins: list[str] = field(default_factory=list, kw_only=True)  # modules that add terms, observations, ...
+    logger: str | None = field(default=None, kw_only=True)  # wandb: besides metrics.csv and TensorBoard's events
 
     @classmethod
     def complete(cls, plain: DictConfig) -> DictConfig:
@@ -168,6 +169,6 @@ def load_train_config(overrides: list[str] | None = None) -> TrainConfig:
 # Keys that a resumed run may change; all others are as saved, or the run would not resume exactly.
 # Another number of processes means new worlds; with out=, a new run folder goes on from the checkpoint.
 RESUME_KEYS = (
-    "resume", "samples", "minutes", "checkpoint_minutes", "tensorboard", "progress", "device", "processes", "plugins",
-    "engine.graph", "out", "judge.serves", "judge.last_serves", "judge.after", "judge.video",
+    "resume", "samples", "minutes", "checkpoint_minutes", "tensorboard", "logger", "progress", "device", "processes",
+    "plugins", "engine.graph", "out", "judge.serves", "judge.last_serves", "judge.after", "judge.video",
 )  # fmt: skip

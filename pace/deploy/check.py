@@ -64,10 +64,13 @@ def open_session(file: Path) -> Session:
     return onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
 
 
-def compare(session: Session, policy: TaskPolicy, config: ExportConfig) -> dict[str, float]:
+def compare(
+    session: Session, policy: TaskPolicy, config: ExportConfig, kept: list[dict[str, NDArray[np.float32]]] | None = None
+) -> dict[str, float]:
     """Largest difference of each output to what the task itself computes, over recorded observations.
 
-    Worlds play with the policy and some noise on its actions; serves follow one another and robots fall.
+    Worlds play with the policy and some noise on its actions; serves follow one another and robots fall. The readings
+    (1, size) of the first world are appended to ``kept``.
     """
     env = policy.make_env(config.check_worlds, "cpu", config.seed, CHECK_OVERRIDES)
     readings, names = RawReadings(env, policy.config), list(output_ports(policy.config))
@@ -75,16 +78,19 @@ def compare(session: Session, policy: TaskPolicy, config: ExportConfig) -> dict[
     generator = torch.Generator().manual_seed(config.seed)
     largest: dict[str, float] = {}
     for _ in range(config.check_steps):
-        found = dict(zip(names, session.run(None, readings.numpy()), strict=True))
-        kept = found["state_next"]
-        found |= {name: kept[:, state.columns[name]] for name in env.actor.estimates}
+        frame = readings.numpy()
+        if kept is not None:
+            kept.append({name: value[:1].copy() for name, value in frame.items()})
+        found = dict(zip(names, session.run(None, frame), strict=True))
+        memory = found["state_next"]
+        found |= {name: memory[:, state.columns[name]] for name in env.actor.estimates}
         action = policy(env.policy_observation)
         for name, value in expected_outputs(env, policy, action).items():
             difference = float(np.abs(found[name] - value.numpy()).max())
             largest[name] = difference if np.isnan(difference) else max(largest.get(name, 0.0), difference)
         env.advance(action + ACTION_NOISE * torch.randn(action.shape, generator=generator))
         done = env.terminated | env.truncated
-        readings.push(kept)
+        readings.push(memory)
         env.reset_worlds(done)
         readings.restart(done)
     return largest

@@ -2,8 +2,8 @@
 
 The file takes one frame of raw sensor readings and a state, and gives joint targets and the next state: normaliser,
 predictor, estimates, forward kinematics and actor are in it (:mod:`pace.deploy.graph`). What else the robot's own code
-needs lies in its metadata, as JSON. The file is played beside torch on observations recorded in the task, and only kept
-if both agree.
+needs lies in its metadata, as JSON, and in the contract beside it (:mod:`pace.deploy.contract`). The file is played
+beside torch on observations recorded in the task, and only kept if both agree.
 """
 
 from __future__ import annotations
@@ -20,10 +20,13 @@ import mujoco
 import torch
 from omegaconf import DictConfig
 
-from pace.config.base import parse, to_dict
+from pace.config.base import compose, parse, to_dict
 from pace.config.commands import ExportConfig
+from pace.config.extras import cure
 from pace.config.training import TrainConfig
+from pace.deploy import contract
 from pace.deploy.check import compare, open_session
+from pace.deploy.contract import write_contract
 from pace.deploy.graph import (
     DeployedPolicy,
     input_ports,
@@ -31,6 +34,7 @@ from pace.deploy.graph import (
     output_ports,
     state_parts,
 )
+from pace.deploy.player import FORMAT
 from pace.onboard.estimate import columns
 from pace.rl.policies import TaskPolicy, load_policy
 from pace.runs.own_files import make_out
@@ -40,8 +44,6 @@ from pace.sim.robot_spec import RobotSpec
 from pace.task.observations import POLICY, layout
 
 FILE = "policy.onnx"  # in the folder that the command writes
-#: Of the metadata. 4: one frame of readings, with the ball's age but not its launch, and one state; 5: the base's age.
-FORMAT = 5
 #: What lies outside the file.
 PROCEDURE = (
     "Run at 1 / control_dt Hz: give the current readings, and as state the state_next of the call before. A state of "
@@ -63,7 +65,7 @@ def export_from_config(composed: DictConfig) -> None:
     policy = load_policy(config.run)
     if config.out and Path(config.out).suffix == ".onnx":
         raise ExportError(f"out={config.out} must be a folder, in which policy.onnx is written")
-    out = make_out(config.out, "export", [FILE]) / FILE
+    out = make_out(config.out, "export", [FILE, contract.FILE]) / FILE
     differences = export_policy(policy, out, config)
     count = config.check_worlds * config.check_steps
     units = {name: port.unit for name, port in output_ports(policy.config).items()}
@@ -71,11 +73,22 @@ def export_from_config(composed: DictConfig) -> None:
     print(f"largest difference between onnxruntime and torch over {count:,} recorded observations:")
     for name, value in differences.items():
         print(f"  {name:<20}{value:.1e} {units.get(name, '(state)')}")
-    print(f"wrote {out} ({out.stat().st_size / 2**20:.2f} MiB)")
+    print(f"wrote {out} ({out.stat().st_size / 2**20:.2f} MiB)\nwrote {out.with_suffix('.json')}")
+
+
+def export_run(run: Path) -> Path:
+    """Export a run's newest policy into its folder, as ``pace export`` does if nothing else is asked; the file.
+
+    Errors: :class:`ExportError`.
+    """
+    usual = parse(compose("export", [f"run='{run}'"]), ExportConfig)
+    export_policy(load_policy(run), run / FILE, usual)
+    return run / FILE
 
 
 def export_policy(policy: TaskPolicy, out: Path, config: ExportConfig) -> dict[str, float]:
-    """Write ``out`` and return the largest difference of each output to torch on recorded observations.
+    """Write ``out`` and its contract, and return the largest difference of each output to torch on recorded
+    observations.
 
     Errors: :class:`ExportError` for a difference above ``config.tolerance`` (the file is then not written), for a
     missing package and a folder that cannot be written.
@@ -86,14 +99,19 @@ def export_policy(policy: TaskPolicy, out: Path, config: ExportConfig) -> dict[s
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=out.parent, prefix=".export_") as folder:
-            file = Path(folder) / "policy.onnx"
+            file = Path(folder) / out.name
             save_graph(graph, policy.config, file)
-            differences = compare(open_session(file), policy, config)
+            frames: list[dict[str, Any]] = []
+            session = open_session(file)
+            differences = compare(session, policy, config, frames)
             largest = max(differences.values())
             if not largest <= config.tolerance:  # also NaN
                 raise ExportError(f"onnxruntime and torch differ by {largest:.2g}, more than {config.tolerance:g}")
-            describe(file, metadata(policy, model, differences, config))
+            content = metadata(policy, model, differences, config)
+            describe(file, content)
+            beside = write_contract(file, content, session, frames[: contract.STEPS], config.tolerance)
             file.replace(out)
+            beside.replace(out.with_suffix(".json"))
     except OSError as error:
         raise ExportError(f"{out} cannot be written: {error}") from error
     return differences
@@ -105,7 +123,7 @@ def _require_packages() -> None:
         import onnxruntime
         import onnxscript
     except ImportError as error:
-        raise ExportError(f"{error}: pip install 'pace-table-tennis[export]'") from error
+        raise ExportError(f"{error}: {cure('export')}") from error
     del onnx, onnxruntime, onnxscript
 
 

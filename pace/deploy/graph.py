@@ -26,11 +26,14 @@ from pace.task.observations import POLICY, check_policy, width
 
 
 class Port(NamedTuple):
-    """An input or output of the network: numbers, unit, meaning."""
+    """An input or output of the network: numbers, unit, meaning, the frame that it is given in, and its age: that of
+    the call, or the input that says how old it is."""
 
     size: int
     unit: str
     meaning: str
+    frame: str = "-"
+    age: str = "current"
 
 
 def joints_of(config: TaskConfig) -> int:
@@ -41,13 +44,17 @@ def joints_of(config: TaskConfig) -> int:
 def readings(joints: int) -> dict[str, Port]:
     """Inputs (N, size) besides the state: the readings of one control step."""
     return {
-        "base_angular_velocity": Port(3, "rad/s", "gyroscope of the trunk, body frame"),
-        "base_position": Port(3, "m", "trunk, world frame"),
-        "projected_gravity": Port(3, "1", "direction of gravity in the body frame; upright: (0, 0, -1)"),
-        "heading": Port(2, "1", "x axis of the trunk on the ground, world frame; towards the opponent: (1, 0)"),
-        "joint_position": Port(joints, "rad", "in the order of joint_names, not relative to the nominal pose"),
-        "joint_velocity": Port(joints, "rad/s", "in the order of joint_names"),
-        "ball_position": Port(3, "m", "centre of the ball, world frame; without a new frame its last"),
+        "base_angular_velocity": Port(3, "rad/s", "gyroscope of the trunk, body frame", "body"),
+        "base_position": Port(3, "m", "trunk, world frame", "world", "base_age"),
+        "projected_gravity": Port(3, "1", "direction of gravity in the body frame; upright: (0, 0, -1)", "body"),
+        "heading": Port(
+            2, "1", "x axis of the trunk on the ground, world frame; towards the opponent: (1, 0)", "world", "base_age"
+        ),
+        "joint_position": Port(joints, "rad", "in the order of joint_names, not relative to the nominal pose", "joint"),
+        "joint_velocity": Port(joints, "rad/s", "in the order of joint_names", "joint"),
+        "ball_position": Port(
+            3, "m", "centre of the ball, world frame; without a new frame its last", "world", "ball_age"
+        ),
         "base_age": Port(1, "s", "time since the frame with base position and heading was captured"),
         "base_new": Port(1, "0 or 1", "1: a frame with them arrived since the call before"),
         "ball_age": Port(1, "s", "time since the ball's frame was captured"),
@@ -58,10 +65,12 @@ def readings(joints: int) -> dict[str, Port]:
 def results(joints: int) -> dict[str, Port]:
     """Outputs (N, size) besides the state."""
     return {
-        "joint_target": Port(joints, "rad", "targets of the joints' position control until the next call"),
-        "action": Port(joints, "1", "the network's output: the same relative to nominal_pose, in action_scale rad"),
-        "predicted_apex": Port(3, "m", "learned prediction, or the idle point while there is nothing to hit"),
-        "predicted_target": Port(3, "m", "point at which the paddle should meet the ball, likewise"),
+        "joint_target": Port(joints, "rad", "targets of the joints' position control until the next call", "joint"),
+        "action": Port(
+            joints, "1", "the network's output: the same from nominal_pose on, in action_scale rad", "joint"
+        ),
+        "predicted_apex": Port(3, "m", "learned prediction, or the idle point while there is nothing to hit", "world"),
+        "predicted_target": Port(3, "m", "point at which the paddle should meet the ball, likewise", "world"),
         "predicted_time": Port(1, "s", "until the ball is at the target; 0 while there is nothing to hit"),
         "something_to_hit": Port(1, "0 or 1", "the ball can still be hit, as far as the robot can know"),
     }

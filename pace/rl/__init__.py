@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 from pace.lazy import on_first_use
 
 if TYPE_CHECKING:
+    from pace.rl.environment import make_env
     from pace.rl.policies import load_policy
-    from pace.task.env import make_env
 
 __all__ = ["load_policy", "make_env"]
 
 # Names of :mod:`pace` that users found here first.
-__getattr__ = on_first_use(__name__, {"load_policy": "pace.rl.policies", "make_env": "pace.task.env"})
+__getattr__ = on_first_use(__name__, {"load_policy": "pace.rl.policies", "make_env": "pace.rl.environment"})

@@ -111,7 +111,8 @@ def _counters(row: dict[str, float]) -> dict[str, float]:
 def train_predictor(composed: DictConfig) -> None:
     """Train as the composed configuration says, and print what was written."""
     config = parse(composed, TrainConfig)
-    run = RunFolder(config.out, to_dict(config), config.tensorboard, files=[RESULT])  # before the first second of work
+    # before the first second of work
+    run = RunFolder(config.out, to_dict(config), config.tensorboard, files=[RESULT], logger=config.logger)
     config.out = str(run.path)
     try:
         with terminable():
@@ -135,4 +136,5 @@ def _train(config: TrainConfig, run: RunFolder) -> None:
         print(f"{name}: {value:.2f}")
     for file in (folder, run.path / RESULT, run.path / METRICS):
         print(f"wrote {file}")
+    run.finish([run.path / RESULT])
     session.stop.require_not_terminated()

@@ -37,43 +37,48 @@ from pace.distributed import (
 from pace.memory import available_memory
 from pace.predictor.network import BallPredictor, make_predictor
 from pace.predictor.priors import resolve_priors
+from pace.rl.closing import Export, Film, close, report
 from pace.rl.curriculum import Curriculum
 from pace.rl.judge import Judge
 from pace.rl.kernels import warm
 from pace.rl.plan import in_millions
 from pace.rl.policies import locate
+from pace.rl.start import other_choices
 from pace.rl.trainer import Summary, Trainer, device_type_of, restarts_worlds
 from pace.runs.checkpoint import Checkpoint, CheckpointError, load_checkpoint
 from pace.runs.checkpoint_folders import FOLDER, NAME
 from pace.runs.files import tell
 from pace.runs.interrupt import terminable
 from pace.runs.learning_curve import CURVE
-from pace.runs.progress import rate_texts
-from pace.runs.run_folder import EVALUATION, FILM, METRICS, RunFolder, is_run
+from pace.runs.run_folder import CONTRACT, EVALUATION, FILM, POLICY, RunFolder, is_run
 
 if TYPE_CHECKING:
     from pace.task.env import TableTennisEnv
 
-#: Makes the judge of a run; films its newest policy for so long, s.
+#: Makes the judge of a run.
 MakeJudge = Callable[[JudgeConfig], Judge]
-Film = Callable[[Path, float], None]
 COMMAND = "pace.rl.train"
+OWN = (FILM, EVALUATION, POLICY, CONTRACT)  # files of a run besides those of every run
+UPLOADED = (FILM, CURVE, POLICY, CONTRACT)  # to a logger, at the end of a run
 SEEDS_APART = 1_000_003  # between the stages of a curriculum: further than seeds of runs lie apart
 
 
-def train_from_config(composed: DictConfig, make_judge: MakeJudge | None = None, film: Film | None = None) -> None:
+def train_from_config(
+    composed: DictConfig, make_judge: MakeJudge | None = None, film: Film | None = None, export: Export | None = None
+) -> None:
     """Train as the composed configuration says, and print what was written.
 
-    A run that comes to its end is judged by what ``make_judge`` makes, and filmed. Its folder is claimed before
+    A run that comes to its end is judged by what ``make_judge`` makes, and filmed; with a ``logger`` it is also
+    exported, and all of this uploaded. Its folder is claimed before
     the work begins; a new folder is removed if the run cannot start.
 
     Errors: :class:`Terminated` for a SIGTERM or SIGHUP, whatever the run is doing; what is saved can be resumed.
     """
     with terminable():
-        _train(composed, make_judge, film)
+        _train(composed, make_judge, film, export)
 
 
-def _train(composed: DictConfig, make_judge: MakeJudge | None, film: Film | None) -> None:
+def _train(composed: DictConfig, make_judge: MakeJudge | None, film: Film | None, export: Export | None) -> None:
     config = parse(composed, TrainConfig)
     overrides = list(HydraConfig.get().overrides.task)
     if config.resume:
@@ -97,10 +102,14 @@ def _train(composed: DictConfig, make_judge: MakeJudge | None, film: Film | None
         raise
     if summary is None:
         return
-    report(summary)
-    trainer.stop.require_not_terminated()
-    if trainer.judge is not None and trainer.stop.name is None:
-        close(trainer.judge, film, summary, config.judge)
+    assert run is not None  # only rank 0 has a summary
+    try:
+        report(summary)
+        trainer.stop.require_not_terminated()
+        if trainer.judge is not None and trainer.stop.name is None:
+            close(trainer.judge, film, summary, config.judge, export if run.is_tracked else None)
+    finally:
+        run.finish([run.path / name for name in UPLOADED])
 
 
 def train_run(
@@ -125,20 +134,6 @@ def train_run(
             announce(trainer, run, saved, chosen)
             trainer.judge = make_judge(config.judge) if make_judge else None
         return trainer.train(), trainer
-
-
-def close(judge: Judge, film: Film | None, summary: Summary, config: JudgeConfig) -> None:
-    """Tell and show what a finished run does without exploration, and what may come next; Ctrl-C leaves it out."""
-    run, minutes = summary.folder, summary.seconds / 60.0
-    if minutes < config.after:
-        return
-    try:
-        judge.last(run, minutes)
-        if film is not None and config.video > 0.0:
-            film(run, config.video)
-    except KeyboardInterrupt:
-        tell("left out; the run is complete")
-    tell(f"next: pace play {run} | pace evaluate {run} | pace export {run} out=robot")
 
 
 def machine_for(config: TrainConfig, device: torch.device) -> automatic.Machine:
@@ -227,7 +222,10 @@ def build_trainer(
     if saved:
         trainer.resume(saved)
     elif start:
-        trainer.start_from(start)
+        try:
+            trainer.start_from(start)
+        except CheckpointError as error:
+            raise CheckpointError(f"{error}{other_choices(config, start.config)}") from error
     return trainer
 
 
@@ -275,7 +273,7 @@ def learned_priors(start: Checkpoint) -> PredictorPriors:
 
 def open_run(config: TrainConfig, first_update: int) -> RunFolder:
     """The run folder that ``config`` names, or a new one, whose path ``config`` then holds."""
-    run = RunFolder(config.out, to_dict(config), config.tensorboard, first_update, (FILM, EVALUATION))
+    run = RunFolder(config.out, to_dict(config), config.tensorboard, first_update, OWN, config.logger)
     config.out = str(run.path)
     return run
 
@@ -293,15 +291,4 @@ def announce(trainer: Trainer, run: RunFolder, saved: Checkpoint | None, chosen:
     tell(
         f"training {trainer.config.name}: {trainer.config.num_worlds} worlds on {trainer.device}{shared}, "
         f"{trainer.algorithm.describe()}, run folder {run.path}"
-    )
-
-
-def report(summary: Summary) -> None:
-    """Print how the run ended and which files it wrote."""
-    folder = summary.folder
-    tell(
-        f"{summary.reason}: {summary.updates} updates, {summary.samples:,} samples, {summary.seconds / 60:.1f} min\n"
-        f"last updates: {', '.join([*rate_texts(summary.rates), *summary.faults])}\n"
-        f"wrote {summary.checkpoint}\n"
-        f"wrote {folder / METRICS}" + (f"\nwrote {folder / CURVE}" if summary.curve else "")
     )

@@ -20,10 +20,10 @@ main = partial(run_command, "train")
 
 
 def train_from_config(composed: DictConfig) -> None:
-    """Train as the composed configuration says; judge the run while it trains and at its end, and film it."""
+    """Train as the composed configuration says; judge the run while it trains and at its end, film and export it."""
     from pace.rl.session import train_from_config as train  # torch takes seconds to load
 
-    train(composed, _judge, _film)
+    train(composed, _judge, _film, _export)
 
 
 def _judge(config: JudgeConfig) -> Judge:
@@ -44,6 +44,19 @@ def _film(run: Path, seconds: float) -> None:
         film_run(run, file, seconds)
     except RenderError as error:
         tell(f"no video: {error}")
+    else:
+        tell(f"wrote {file}")
+
+
+def _export(run: Path) -> None:
+    """Export the newest policy of ``run`` into its folder, or say what is missing for that."""
+    from pace.deploy.export import ExportError, export_run
+    from pace.runs.files import tell
+
+    try:
+        file = export_run(run)
+    except ExportError as error:
+        tell(f"no ONNX file: {error}")
     else:
         tell(f"wrote {file}")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +25,7 @@ SLIM_COLUMNS = (
     "update", "samples", "wall_s", "hit_rate", "success_rate", "fall_rate", "serves", "predictor_rmse_cm",
     "mean_reward", "kl", "lr", "policy_std",
 )  # fmt: skip
+LONGEST_ROW = 16_384  # letters of a row of ``metrics.csv``, at most
 SLIM_ROWS = 4  # rows of ``metrics.csv`` in one of a slim CSV
 _LAST = ("update", "samples", "wall_s")  # totals since the start of a run: a slim row has the last value
 _SHARES = ("hit_rate", "success_rate")  # of the serves of a row
@@ -79,6 +81,21 @@ def read_metrics(file: str | Path, columns: Iterable[str] | None = None) -> dict
     head = [name for name in (rows[0] if rows else ()) if name is not None]  # None: cells beyond the columns
     names = [name for name in head if columns is None or name in set(columns)]
     return {name: [_number(row[name]) for row in rows] for name in names}
+
+
+def last_row(file: Path) -> dict[str, float]:
+    """The last whole row of a ``metrics.csv`` that may still grow; empty if there is none."""
+    try:
+        with file.open("rb") as handle:
+            head = handle.readline()
+            handle.seek(max(len(head), handle.seek(0, os.SEEK_END) - LONGEST_ROW))
+            rows = (
+                handle.read().decode(errors="replace").split("\n")[:-1]
+            )  # the part after the last line end is unfinished
+    except OSError:
+        return {}
+    names, cells = head.decode(errors="replace").strip().split(","), rows[-1].split(",") if rows else []
+    return {name: _number(cell) for name, cell in zip(names, cells, strict=True)} if len(names) == len(cells) else {}
 
 
 def _number(cell: str | None) -> float:

@@ -26,6 +26,7 @@ from pace.runs.files import reason, say, write_whole
 from pace.runs.learning_curve import CURVE
 from pace.runs.metrics_file import EventsFile, MetricsFile
 from pace.runs.own_files import listed, make_out, note, remove_unused, require_own
+from pace.runs.tracker import Tracker, require_logger
 
 STAMP = "# format: "  # begins the first line of a run's configuration
 LOCK = ".lock"
@@ -33,6 +34,7 @@ CHECKPOINTS_KEPT = 4
 REPLAYS, REPLAY_SUFFIX, MOST_REPLAYS = "replays", ".replay", 16
 CONFIG, VERSIONS, METRICS, EVENTS = "config.yaml", "versions.json", "metrics.csv", "events"
 FILM, EVALUATION = "play.mp4", "evaluation"  # of a training run that has come to its end
+POLICY, CONTRACT = "policy.onnx", "policy.json"  # likewise, with a logger that takes them
 FILES = (CONFIG, VERSIONS, METRICS, CURVE)  # of every run
 PACKAGES = ("torch", "torchrl", "tensordict", "mujoco", "mujoco-warp", "warp-lang", "numpy", "hydra-core")
 LEFTOVER = re.compile(r"\.(config\.yaml|versions\.json|metrics\.csv)\.\d+\.tmp")  # of a kill while a file was written
@@ -78,9 +80,10 @@ class RunFolder:
     ``first_update``, its last checkpoint, are dropped then.
 
     Args: path: ``None`` is a :func:`pace.runs.own_files.new_folder` of the configuration's ``name``. ``files``: names
-    that the command writes there besides :data:`FILES`.
-    Errors: :class:`ConfigError` for a folder that cannot be made, that another process owns, or that holds a later
-    checkpoint or somebody else's files of these names.
+    that the command writes there besides :data:`FILES`. ``logger``: of :data:`pace.runs.tracker.LOGGERS`; it goes on
+    after :meth:`close`, until :meth:`finish`.
+    Errors: :class:`ConfigError` for a logger that is not there, for a folder that cannot be made, that another process
+    owns, or that holds a later checkpoint or somebody else's files of these names.
     """
 
     def __init__(
@@ -90,7 +93,9 @@ class RunFolder:
         tensorboard: bool,
         first_update: int = 0,
         files: Sequence[str] = (),
+        logger: str | None = None,
     ) -> None:
+        require_logger(logger)
         self._made = path is None or not Path(path).exists()
         self.path = make_out(None if path is None else str(path), str(config.get("name", "")))
         self._config, self._first_update = config if path else config | {"out": str(self.path)}, first_update
@@ -98,7 +103,8 @@ class RunFolder:
         self._require_own()
         self._lock = FileLock(self.path / LOCK)  # the system releases it when the process ends, for whatever reason
         self._claim()
-        self._tensorboard = tensorboard
+        self._tensorboard, self._logger = tensorboard, logger
+        self._tracker: Tracker | None = None
         self._metrics: MetricsFile | None = None
         self._events: EventsFile | None = None
 
@@ -148,6 +154,8 @@ class RunFolder:
         if self._tensorboard:
             first = self._metrics.samples + 1 if self._first_update else 0
             self._events = EventsFile(self.path / EVENTS, first)
+        if self._logger is not None:
+            self._tracker = Tracker(self.path, self._config)
 
     def _describe(self) -> None:
         """Write configuration and versions, and note all names as the run's own."""
@@ -166,8 +174,9 @@ class RunFolder:
         self.restore()
         assert self._metrics is not None  # begin() opened it
         self._metrics.add(row)
-        if self._events is not None:
-            self._events.add(row)
+        for log in (self._events, self._tracker):
+            if log is not None:
+                log.add(row)
 
     def save(self, update: int, checkpoint: Checkpoint, last: bool = False) -> Path | None:
         """Write the checkpoint of an update, and delete old ones; returns its folder.
@@ -218,9 +227,22 @@ class RunFolder:
                 log.close()
         self._lock.release()
 
+    @property
+    def is_tracked(self) -> bool:
+        """Whether a logger takes files at the end."""
+        return self._tracker is not None
+
+    def finish(self, files: Sequence[Path] = ()) -> None:
+        """Hand those of the files that are there to the logger, if there is one, and finish it."""
+        if self._tracker is not None:
+            tracker, self._tracker = self._tracker, None
+            tracker.upload(files)
+            tracker.close()
+
     def abandon(self) -> None:
         """Release the folder of a run that could not start; a new one is removed."""
         self.close()
+        self.finish()
         if self._made and self._metrics is None:
             remove_unused(self.path, (LOCK,))
 

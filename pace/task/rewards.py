@@ -67,6 +67,11 @@ class RewardManager(Stateful):
         torch.mv(self.values.T, self._weights, out=self.reward)
         self.sums.addcmul_(self.values.sum(1), self._weights)
 
+    @property
+    def weighted(self) -> Tensor:
+        """(T, N): what each term adds to the reward."""
+        return self.values * self._weights.unsqueeze(1)
+
     def pop_sums(self) -> dict[str, Tensor]:
         """Sums of the weighted terms (0-d) since the last call; they add up to the sum of the rewards."""
         popped = dict(zip(self.names, self.sums.clone().unbind(), strict=True))

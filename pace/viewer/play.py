@@ -10,9 +10,9 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from pace.config.base import ConfigError, compose, parse
-from pace.config.commands import PlayConfig
+from pace.config.page import PlayConfig
 from pace.evaluation.sweep import ball_presets
-from pace.rl.policies import TaskPolicy, load_policy
+from pace.rl.policies import TaskPolicy, built_in_policy, load_policy
 from pace.runs.own_files import started_out
 from pace.runs.progress import SECONDS_PER_LINE
 from pace.runs.run_folder import REPLAY_SUFFIX
@@ -31,6 +31,8 @@ def play_from_config(composed: DictConfig) -> None:
         replay(config)
         return
     policy = load_policy(config.run)
+    if config.policy != "run":
+        policy = built_in_policy(config.policy, config.seed, like=policy)
     overrides = [f"engine.physics_dt={config.physics_dt}", *config.overrides]
     if config.video:
         with place_of(config.video):  # before the worlds are made, which may compile
@@ -82,7 +84,9 @@ def film(config: PlayConfig, show: Shown, about: str) -> None:
     size = (config.width, config.height)
     interval = 0.2 if sys.stderr.isatty() else SECONDS_PER_LINE
     with tqdm(total=total, desc=file.name, unit="picture", mininterval=interval) as bar:
-        write_video(file, show, config.seconds, config.fps, config.speed, *size, on_picture=lambda: _tick(bar))
+        write_video(
+            file, show, config.seconds, config.fps, config.speed, *size, on_picture=lambda: _tick(bar), view=config.view
+        )
     print(f"{about}\n{show.text()}\nwrote {file}")
 
 

@@ -22,6 +22,7 @@ from pace.sim.render import Ball, Line, Mark
 from pace.task.env import TableTennisEnv
 from pace.task.game import Outcome
 from pace.task.resets import ServeSampler
+from pace.viewer.bars import RewardBars
 
 Array = NDArray[np.float64]
 
@@ -176,20 +177,22 @@ class Snapshot:
 class Show:
     """A policy that plays serve after serve in one world; after a fall the robot is reset.
 
-    Attributes: ``env``, ``score``.
+    Attributes: ``env``, ``score``, ``bars`` of the reward terms (``None`` without ``rewards``).
 
     Args:
         policy: as :func:`pace.rl.load_policy` gives it.
         overrides: of the saved task, after those of :data:`SHOW_OVERRIDES`.
         seed: of all random numbers.
+        rewards: whether to compute the saved reward, whose terms must then be known.
 
-    Errors: :class:`pace.config.ConfigError` for a wrong override.
+    Errors: :class:`pace.config.ConfigError` for a wrong override, and an unknown reward term.
     """
 
-    def __init__(self, policy: TaskPolicy, overrides: Sequence[str] = (), seed: int = 1) -> None:
+    def __init__(self, policy: TaskPolicy, overrides: Sequence[str] = (), seed: int = 1, rewards: bool = False) -> None:
         self.policy = policy.to("cpu")
         config = override_task(policy.config, [*SHOW_OVERRIDES, *overrides, "serve.serves_per_episode=0"])
-        self.env = ShowEnv(without_reward(config), 1, "cpu", seed, policy.predictor)
+        self.env = ShowEnv(config if rewards else without_reward(config), 1, "cpu", seed, policy.predictor)
+        self.bars = RewardBars(self.env.rewards.names, self.control_dt) if rewards else None
         self.score = Score()
         self.flights = 0
         self._line = FlightLine(config)
@@ -234,6 +237,8 @@ class Show:
         env = self.env
         self._ball_before = env.worlds.ball.position[0].numpy().astype(np.float64)
         env.advance(self.policy(env.policy_observation))
+        if self.bars is not None:
+            self.bars.update(env.rewards.weighted[:, 0].double().numpy())
         self._qpos_path = env.worlds.engine.qpos_path[0].numpy().astype(np.float64)
         self._ball_knots = self._knots()
         if bool(env.serve_over):

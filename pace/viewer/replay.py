@@ -15,7 +15,7 @@ from pace.sim.replay import Replay, ReplayError, WorldReplay, load_replay
 from pace.sim.robot_spec import RobotSpec
 from pace.viewer.playback import Snapshot
 from pace.viewer.scene import BrowserScene
-from pace.viewer.server import number, open_server
+from pace.viewer.server import number, open_server, stop
 
 FRAME = 1.0 / 30.0  # s between pictures
 PAUSE = 0.5  # s on the last state, before the next world
@@ -124,4 +124,4 @@ class ReplayPage:
                     self._text.content = self.show.text()
                 time.sleep(FRAME)
         finally:
-            self.server.stop()
+            stop(self.server)

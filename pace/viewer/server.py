@@ -9,6 +9,7 @@ from contextlib import redirect_stdout
 from io import StringIO
 from typing import Any
 
+from pace.config.extras import cure
 from pace.viewer.gate import Gate
 from pace.viewer.messages import listen_to_controls
 
@@ -24,7 +25,7 @@ def require_viewer() -> None:
     try:
         import mjviser
     except ImportError as error:
-        raise PageError(f"{error}: pip install 'pace-table-tennis[viewer]'") from error
+        raise PageError(f"{error}: {cure('viewer')}") from error
     del mjviser
 
 
@@ -59,14 +60,14 @@ def open_server(host: str, port: int) -> tuple[Any, str]:
     if is_local(host):
         server = _viser(host, port)
         if server.get_port() != port:  # another process took it first
-            server.stop()
+            stop(server)
             raise PageError(f"port {port} of {host} was taken just now: give another port=")
         return server, f"http://{host}:{port}"
     server = _viser(LOCAL, 0)
     try:
         gate = Gate(host, port, server.get_port())
     except OSError as error:
-        server.stop()
+        stop(server)
         raise PageError(f"port {port} of {host} was taken just now ({error}): give another port=") from error
     named = socket.gethostname() if host in ("0.0.0.0", "::") else host
     return server, f"http://{named}:{port}/?token={gate.token}"
@@ -79,6 +80,12 @@ def _viser(host: str, port: int) -> Any:
         server = viser.ViserServer(host=host, port=port, label="PACE", verbose=False)
     listen_to_controls(server)
     return server
+
+
+def stop(server: Any) -> None:
+    """Stop a server of :func:`open_server`, without its word about it."""
+    with redirect_stdout(StringIO()):
+        server.stop()
 
 
 def number(slider: Any, start: float) -> float:

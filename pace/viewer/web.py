@@ -17,7 +17,7 @@ from pace.runs.checkpoint import CheckpointError
 from pace.runs.checkpoint_folders import FOLDER, list_checkpoints
 from pace.viewer.playback import Serve, Show, Snapshot
 from pace.viewer.scene import BrowserScene
-from pace.viewer.server import number, open_server, require_port, require_viewer
+from pace.viewer.server import number, open_server, require_port, require_viewer, stop
 
 FRAME = 1.0 / 30.0  # s between pictures
 LONGEST_FRAME = 0.1  # s: a page does not catch up after a longer delay
@@ -76,11 +76,14 @@ class Page:
         self._ball: str | None = None  # that of the overrides, or of the saved task
         self._policy = policy
         self._requests: SimpleQueue[Callable[[], None]] = SimpleQueue()
-        self.show = Show(policy, overrides, seed)
+        self.show = self._make_show(policy, overrides)
         self.server, self.url = open_server(host, port)
         self._scene = BrowserScene(self.server, self.show.config)
         self._build_controls(balls, speed)
         self._next_look = 0.0
+
+    def _make_show(self, policy: TaskPolicy, overrides: Sequence[str]) -> Show:
+        return Show(policy, overrides, self._seed)
 
     def draw(self, snapshot: Snapshot) -> None:
         """Send all changes to the browsers."""
@@ -173,7 +176,7 @@ class Page:
         """Start a new show, with a new score, for another policy or another ball."""
         chosen = [f"ball={ball}"] if ball else []
         try:
-            self.show = Show(policy, [*self._overrides, *chosen], self._seed)
+            self.show = self._make_show(policy, [*self._overrides, *chosen])
         except ConfigError as error:
             self._status.content = f"**{error}**"
             return
@@ -201,7 +204,7 @@ class Page:
                 before = now
                 time.sleep(max(0.0, FRAME - (time.monotonic() - now)))
         finally:
-            self.server.stop()
+            stop(self.server)
 
     def step(self, elapsed: float) -> None:
         """Do what the browsers have asked for, and show them ``elapsed`` s more; without a browser, wait a moment."""

@@ -11,8 +11,9 @@ from subprocess import Popen
 
 import pytest
 
-from pace.arrays.kernel_cache import private_folder
+from pace.arrays.kernel_cache import private_folder, without_line
 from pace.config.base import ConfigError
+from pace.devices import has_driver
 
 ROOT = Path(__file__).parents[2]
 #: Another user, who may read everything (this environment belongs to root) and write nothing.
@@ -51,6 +52,30 @@ def test_a_folder_is_this_users_alone(tmp_path: Path, monkeypatch: pytest.Monkey
     folder.symlink_to(tmp_path)
     with pytest.raises(ConfigError, match="not this user's alone"):
         private_folder("why")
+
+
+def test_a_line_of_native_code_is_left_out_and_others_stay(capfd: pytest.CaptureFixture[str]) -> None:
+    with without_line(b"no driver"):
+        os.write(2, b"one\nWarning: no driver here\ntwo\n")
+        assert capfd.readouterr().err == ""
+    assert capfd.readouterr().err == "one\ntwo\n"
+
+    def fail() -> None:
+        with without_line(b"no driver"):
+            os.write(2, b"no driver\nwhy\n")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail()
+    os.write(2, b"no driver\n")  # again as before
+    assert capfd.readouterr().err == "why\nno driver\n"
+
+
+def test_a_machine_without_a_gpu_is_told_nothing_of_drivers() -> None:
+    if has_driver():
+        pytest.skip("a GPU's driver is here")
+    done = subprocess.run([sys.executable, "-c", "import pace.sim.worlds"], capture_output=True, text=True, cwd=ROOT)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
 def as_nobody(folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:

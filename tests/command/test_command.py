@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import runpy
+import signal
 import subprocess
 import sys
 import tomllib
@@ -20,6 +21,7 @@ from pace.command.help import WIDTH, command_help, command_keys
 from pace.command.keys import file_keys, heading
 from pace.command.table import COMMANDS, Command
 from pace.config.base import compose, config_dir
+from pace.config.extras import cure
 from pace.config.names import choices
 from pace.config.renamed import RENAMED_CHOICES
 from pace.moved import MOVED
@@ -172,6 +174,8 @@ def test_comments_belong_to_their_keys(tmp_path: Path) -> None:
         (("evaluate", "policy=zero", "row=[short]"), "did you mean rows?"),
         (("play", "a", "overrides=[ball=paper]"), "there is no key 'overrides'"),
         (("play", "a", "rows=[short]"), "there is no key 'rows'"),
+        (("play", "a", "reward.scale=2"), "reward.scale= is no key of pace play: no reward is computed"),
+        (("evaluate", "a", "reward.terms.fall.weight=2"), "no key of pace evaluate: no reward is computed"),
         (("play", "a", "--video"), "--video needs a value"),
         (("export", "a", "ball=paper"), "ball= is of pace train, and changes nothing in pace export"),
         (("bench", "samples=1e6"), "bench.train_updates"),
@@ -210,6 +214,33 @@ def test_a_policy_that_is_not_there_names_those_that_are(
         error = capsys.readouterr().err.splitlines()[-1]
         known = ", ".join(sorted(path.name for path in Path("pretrained").glob("*/")))
         assert error.endswith(f"pretrained/pase does not exist; did you mean pace? (pretrained: {known})")
+
+
+@pytest.mark.parametrize("module", ["pace", "pace.rl.train"])
+def test_ctrl_c_while_modules_are_imported_is_one_line(module: str) -> None:
+    """Pressed as soon as the command line is being loaded; hydra and torch come after it."""
+    code = (
+        "import builtins, os, runpy, signal, sys\n"
+        "usual = builtins.__import__\n"
+        "def load(name, *rest, **named):\n"
+        "    if name == 'hydra':\n"
+        "        os.kill(os.getpid(), signal.SIGINT)\n"
+        "    return usual(name, *rest, **named)\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "builtins.__import__ = load\nsys.argv = ['pace', 'train', 'x']\n"
+        f"runpy.run_module({module!r}, run_name='__main__', alter_sys=True)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode in (-signal.SIGINT, 130)
+    assert done.stderr == "error: interrupted\n"
+
+
+def test_missing_packages_are_named_as_they_can_be_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    needed = ["torch>=2", "mjviser>=0.0.14; extra == 'viewer'", "onnx>=1 ; python_version>'3' and extra == \"export\""]
+    monkeypatch.setattr("pace.config.extras.requires", lambda name: needed)
+    assert cure("viewer") == "pip install 'mjviser>=0.0.14'"
+    assert cure("export") == "pip install 'onnx>=1'"
+    assert cure("wandb") == "pip install -e '.[wandb]'"  # of a checkout that was installed before there was one
 
 
 def test_a_command_is_its_module(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -357,14 +357,15 @@ def test_the_example_flies_the_same_ball(example: Any, name: str) -> None:
     assert np.abs(ball.spin - sim.spin[0].numpy()).max() < 3.0
 
 
-def test_the_example_needs_no_pace_and_outruns_the_clock(exported: tuple[Path, dict[str, float]]) -> None:
+def test_the_example_needs_only_the_player_and_outruns_the_clock(exported: tuple[Path, dict[str, float]]) -> None:
     code = (
         "import runpy, sys\n"
         f"sys.argv = ['x', {str(exported[0])!r}, '--serves', '3', '--seed', '2']\n"
         f"try:\n    runpy.run_path({str(EXAMPLE)!r}, run_name='__main__')\n"
         "except SystemExit as end:\n    assert end.code == 0, end.code\n"
         "loaded = {name.split('.')[0] for name in sys.modules}\n"
-        "print(sorted(loaded & {'torch', 'pace', 'warp', 'onnx', 'scipy'}))\n"
+        "print(sorted(loaded & {'torch', 'warp', 'onnx', 'scipy', 'hydra', 'yaml', 'matplotlib'}))\n"
+        "print(sorted(name for name in sys.modules if name.startswith('pace.')))\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
@@ -372,6 +373,7 @@ def test_the_example_needs_no_pace_and_outruns_the_clock(exported: tuple[Path, d
     assert lines[1].startswith("3 serves: hit ")
     assert float(lines[2].split(": ")[1].split(" ")[0]) > 1.0
     assert lines[3] == "[]"
+    assert lines[4] == str(["pace.deploy", "pace.deploy.player", "pace.lazy", "pace.moved"])
 
 
 def test_the_example_refuses_other_files(tmp_path: Path) -> None:

@@ -15,8 +15,9 @@ from pace.config.base import ConfigError, to_dict
 from pace.config.overrides import override_task
 from pace.config.training import load_train_config
 from pace.rl import policies as loading
-from pace.rl.policies import built_in_policy, load_policy, policy_size
-from pace.runs.checkpoint import META, WEIGHTS, CheckpointError
+from pace.rl.policies import built_in_policy, load_policy, locate, policy_size
+from pace.rl.start import other_choices
+from pace.runs.checkpoint import META, WEIGHTS, CheckpointError, load_checkpoint
 from pace.runs.checkpoint_folders import list_checkpoints
 from tests.helpers.saved import make_agent, make_config, save_run
 
@@ -175,3 +176,12 @@ def test_a_pickle_in_disguise_is_not_run(run: Path, tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="is broken"):
         load_policy(run)
     assert not (tmp_path / "boom").exists()
+
+
+def test_what_another_run_was_trained_with_is_named() -> None:
+    """The cure of ``init_from=campaign`` in the default task."""
+    saved = load_checkpoint(locate("campaign"), weights_only=True).config
+    assert other_choices(load_train_config(), saved) == "; it was trained with observation=memory predictor=filter"
+    assert other_choices(load_train_config(["observation=memory", "predictor=filter"]), saved) == ""
+    mine = to_dict(load_train_config()) | {"algo": saved["algo"] | {"name": "mine", "actor_hidden": [8]}}
+    assert other_choices(load_train_config(), mine) == "; it was trained with another algo"

@@ -14,8 +14,8 @@ import pytest
 import torch
 
 from pace.config.judge import JudgeConfig
+from pace.rl.closing import close
 from pace.rl.policies import load_policy
-from pace.rl.session import close
 from pace.rl.train import main
 from pace.rl.trainer import Summary, Trainer
 from pace.runs.checkpoint import load_checkpoint

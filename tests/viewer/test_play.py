@@ -14,11 +14,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from pace.command.arguments import name_options
 from pace.command.table import COMMANDS
 from pace.config.base import ConfigError, compose, parse
-from pace.config.commands import ExportConfig, PlayConfig
+from pace.config.commands import ExportConfig
+from pace.config.page import PlayConfig
 from pace.deploy.export import ExportError, export_policy
 from pace.rl.policies import TaskPolicy, built_in_policy, load_policy
 from pace.runs.checkpoint_folders import list_checkpoints
@@ -130,10 +132,12 @@ def test_video_option() -> None:
     ("override", "message"),
     [
         ("speed=2", "speed must lie in"),
-        ("video=a.gif", r"end in \.mp4"),
+        ("video=a.avi", r"end in \.mp4"),
+        ("view=near", "both or strike"),
         ("width=321", "even number"),
         ("port=0", "port must lie"),
         ("seconds=0", "seconds must be positive"),
+        ("policy=none", "policy must be run, zero or random, not 'none'"),
     ],
 )
 def test_wrong_values(override: str, message: str) -> None:
@@ -152,6 +156,19 @@ def test_a_film_has_all_its_pictures(policy: TaskPolicy, tmp_path: Path) -> None
     assert count == len(seen) == 8  # 0.1 s of play, four times slower, 20 a second
     assert seconds == pytest.approx(0.4, abs=0.06)
     assert next(ffmpeg.read_frames(str(file)))["size"] == (128, 128)
+
+
+@pytest.mark.parametrize("suffix", ["webp", "gif"])
+def test_an_animation_has_all_its_pictures_of_one_view(suffix: str, policy: TaskPolicy, tmp_path: Path) -> None:
+    file = tmp_path / f"out.{suffix}"
+    try:
+        write_video(file, Show(policy, QUICK), 0.1, 20, 0.5, 128, 64, view="strike")
+    except RenderError as error:
+        pytest.skip(str(error))
+    with Image.open(file) as film:
+        assert (film.size, film.n_frames, film.info["loop"]) == ((128, 64), 4, 0)
+        film.load()
+        assert film.info["duration"] == 50
 
 
 def test_a_film_that_is_not_finished_leaves_the_old_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -175,6 +192,16 @@ def test_a_film_that_is_not_finished_leaves_the_old_one(tmp_path: Path, monkeypa
 def run_main(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     monkeypatch.setattr("sys.argv", ["play", *arguments])
     return main()
+
+
+def test_a_task_is_shown_without_a_trained_policy(policy: TaskPolicy, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[TaskPolicy] = []
+    monkeypatch.setattr("pace.viewer.play.page", lambda config, policy, overrides: shown.append(policy))
+    for name in ("zero", "random"):
+        assert run_main(monkeypatch, policy.source, f"policy={name}") == 0
+        assert shown[-1].config == policy.config
+    observation = torch.zeros(2, 3)
+    assert [float(each(observation).abs().max()) > 0.0 for each in shown] == [False, True]
 
 
 def test_bad_input_is_one_line(
@@ -207,11 +234,11 @@ def test_missing_packages_are_named(monkeypatch: pytest.MonkeyPatch, policy: Tas
     monkeypatch.setitem(sys.modules, "mjviser", None)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     monkeypatch.setitem(sys.modules, "onnxscript", None)
-    with pytest.raises(PageError, match=r"mjviser.*pip install 'pace-table-tennis\[viewer\]'"):
+    with pytest.raises(PageError, match=r"mjviser.*pip install .*(mjviser|\[viewer\])"):
         require_viewer()
-    with pytest.raises(RenderError, match=r"imageio_ffmpeg.*pip install 'pace-table-tennis\[viewer\]'"):
+    with pytest.raises(RenderError, match=r"imageio_ffmpeg.*pip install .*(imageio-ffmpeg|\[viewer\])"):
         write_video(tmp_path / "a.mp4", standing(), 0.1, 20, 1.0, 64, 64)
-    with pytest.raises(ExportError, match=r"onnxscript.*pip install 'pace-table-tennis\[export\]'"):
+    with pytest.raises(ExportError, match=r"onnxscript.*pip install .*(onnxscript|\[export\])"):
         export_policy(policy, tmp_path / "a.onnx", parse(compose("export", ["run=any"]), ExportConfig))
 
 
