@@ -166,7 +166,7 @@ def test_an_animation_has_all_its_pictures_of_one_view(suffix: str, policy: Task
     except RenderError as error:
         pytest.skip(str(error))
     with Image.open(file) as film:
-        assert (film.size, getattr(film, "n_frames", None), film.info["loop"]) == ((128, 64), 4, 0)
+        assert (film.size, film.n_frames, film.info["loop"]) == ((128, 64), 4, 0)  # type: ignore[attr-defined]
         film.load()
         assert film.info["duration"] == 50
 
