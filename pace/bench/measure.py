@@ -12,7 +12,7 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from pace.bench import physics, report, training, update
+from pace.bench import neighbours, physics, report, training, update
 from pace.config.automatic import choose
 from pace.config.base import parse
 from pace.config.commands import BenchConfig
@@ -47,7 +47,8 @@ def measure(config: BenchConfig, overrides: list[str], path: Path) -> dict[str, 
         "physics": lambda: physics.native_rates(config),
         "mjwarp": lambda: physics.mjwarp_rates(config, device),
         "update": lambda: update.update_rates(config, device),
-        "train": lambda: training.train_rates(config, overrides),
+        "train": lambda: training.train_rates(config, overrides) | update.product_rates(config, device),
+        "neighbours": lambda: neighbours.neighbour_rates(config, overrides),
         "memory": lambda: training.memory_peak(config, overrides),
     }
     measured: dict[str, float] = {}
@@ -56,7 +57,7 @@ def measure(config: BenchConfig, overrides: list[str], path: Path) -> dict[str, 
         started = time.perf_counter()
         measured |= parts[name]()
         print(f"  {time.perf_counter() - started:.0f} s", flush=True)
-    figures = report.complete(measured)
+    figures = report.complete(measured | report.ideals(measured, config.algo.epochs))
     settings = {"num_worlds": config.num_worlds, "physics_steps": config.substeps, "repeats": config.bench.repeats}
     report.write(path, figures, {"settings": settings, "device": str(device), "machine": machine, **versions()})
     print(report.table(figures))

@@ -6,6 +6,7 @@ import json
 import math
 import os
 import platform
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -34,14 +35,39 @@ FIGURES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     ),
     "rsl_rl_bf16_samples_per_s": ("rsl_rl's update, mixed", "samples/s a pass", ()),
     "matmul_bf16_samples_per_s": ("its matrix products alone, bf16", "samples/s a pass", ()),
-    "train_steps_per_s": ("training loop, default", "steps/s", ("raw_mujoco_steps_per_s",)),
+    "matmul_train_samples_per_s": ("matrix products of training, bf16", "samples/s a pass", ()),
+    "matmul_train_12_samples_per_s": ("the same at 12 steps an update", "samples/s a pass", ()),
+    "train_ideal_steps_per_s": ("ideal loop: mj_step, products", "steps/s", ()),
+    "train_12_ideal_steps_per_s": ("the same at 12 steps an update", "steps/s", ()),
+    "train_steps_per_s": (
+        "training loop, default",
+        "steps/s",
+        ("raw_mujoco_steps_per_s", "train_ideal_steps_per_s"),
+    ),
+    "train_12_steps_per_s": ("the same at 12 steps an update", "steps/s", ("train_12_ideal_steps_per_s",)),
+    "train_alone_steps_per_s": ("training, nothing beside it", "steps/s", ()),
+    "train_beside_one_steps_per_s": ("training beside one busy process", "steps/s", ("train_alone_steps_per_s",)),
+    "train_beside_two_steps_per_s": ("training beside two", "steps/s", ("train_alone_steps_per_s",)),
+    "train_nice_beside_two_steps_per_s": ("the same at nice 10", "steps/s", ("train_alone_steps_per_s",)),
+    "train_one_core_steps_per_s": ("training on one core (taskset)", "steps/s", ("train_alone_steps_per_s",)),
     "train_paper_steps_per_s": ("training loop, paper's networks", "steps/s", ("train_steps_per_s",)),
     "peak_memory_mib": ("peak memory of training", "MiB", ()),
     "peak_memory_4x_mib": ("the same, four times the worlds", "MiB", ()),
 }
 
 
-def ratios(figures: dict[str, float | None]) -> dict[str, float]:
+def ideals(measured: Mapping[str, float], passes: int) -> dict[str, float]:
+    """The training loops that would only step physics at its limit and multiply matrices at theirs, one after the
+    other: 1 / (1 / physics + passes / products), from what was measured in the same run."""
+    physics, found = measured.get("raw_mujoco_steps_per_s"), {}
+    for name in ("train", "train_12"):
+        products = measured.get(f"matmul_{name}_samples_per_s")
+        if physics is not None and products is not None:
+            found[f"{name}_ideal_steps_per_s"] = 1.0 / (1.0 / physics + passes / products)
+    return found
+
+
+def ratios(figures: Mapping[str, float | None]) -> dict[str, float]:
     """``name/base``: quotient, for every pair of ``FIGURES`` that was measured."""
     found: dict[str, float] = {}
     for name, (_, _, bases) in FIGURES.items():

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from pace.config.commands import BenchConfig
@@ -14,6 +15,7 @@ from pace.config.training import load_train_config
 from pace.runs.run_folder import METRICS
 
 POLL_SECONDS = 0.1  # of the memory's high-water mark, which never falls while a process runs
+SELDOM = 12  # control steps an update, of a recipe with fewer updates than the default
 WARM_UP_ROWS = 2  # excluded updates: compilation, allocation
 PAPER_NETWORKS = {"algo": "paper", "observation": "paper"}  # default physics and task, the paper's networks and critic
 
@@ -28,12 +30,19 @@ def without(overrides: list[str], *keys: str) -> list[str]:
 
 
 def train_rates(config: BenchConfig, overrides: list[str]) -> dict[str, float]:
-    """Training with the default recipe and with the paper's networks; peak memory of the former."""
+    """Training with the default recipe, with fewer updates and with the paper's networks; peak memory of the first."""
     updates = config.bench.train_updates
     rate, memory = training_run(config.num_worlds, updates, overrides)
+    seldom = [*without(overrides, "algo.steps"), f"algo.steps={SELDOM}"]
+    seldom_rate, _ = training_run(config.num_worlds, updates, seldom)
     paper = [*without(overrides, *PAPER_NETWORKS), *(f"{key}={value}" for key, value in PAPER_NETWORKS.items())]
     paper_rate, _ = training_run(config.num_worlds, updates, paper)
-    return {"train_steps_per_s": rate, "train_paper_steps_per_s": paper_rate, "peak_memory_mib": memory}
+    return {
+        "train_steps_per_s": rate,
+        "train_12_steps_per_s": seldom_rate,
+        "train_paper_steps_per_s": paper_rate,
+        "peak_memory_mib": memory,
+    }
 
 
 def memory_peak(config: BenchConfig, overrides: list[str]) -> dict[str, float]:
@@ -42,8 +51,10 @@ def memory_peak(config: BenchConfig, overrides: list[str]) -> dict[str, float]:
     return {"peak_memory_4x_mib": memory}
 
 
-def training_run(num_worlds: int, updates: int, overrides: list[str]) -> tuple[float, float]:
-    """Train for ``updates`` in a separate command.
+def training_run(
+    num_worlds: int, updates: int, overrides: list[str], prefix: Sequence[str] = ()
+) -> tuple[float, float]:
+    """Train for ``updates`` in a separate command, which a program may begin: ``prefix``, such as ``nice``.
 
     Returns its control steps a second after the first updates (NaN for a run that is too short), and the largest
     resident memory of its processes together in MiB. Errors: :class:`BenchError` when the command fails.
@@ -60,7 +71,7 @@ def training_run(num_worlds: int, updates: int, overrides: list[str]) -> tuple[f
             "tensorboard": "false",
             "out": folder,
         }
-        command = [sys.executable, "-m", "pace.rl.train", *kept, *(f"{k}={v}" for k, v in settings.items())]
+        command = [*prefix, sys.executable, "-m", "pace.rl.train", *kept, *(f"{k}={v}" for k, v in settings.items())]
         memory = _peak_mib(command, Path(folder) / "output.txt")
         return steady_rate(Path(folder) / METRICS), memory
 

@@ -13,12 +13,14 @@ from torch import Tensor
 
 from pace.arrays.graph import Graphs
 from pace.bench.timing import median_seconds
+from pace.bench.training import SELDOM
 from pace.config.commands import BenchConfig, BenchOptions
 from pace.config.schedules import START
 from pace.config.training import AlgoConfig, load_train_config
-from pace.rl.agent import Agent, compute_dtype
+from pace.rl.agent import Agent, Sizes, compute_dtype
 from pace.rl.ppo import PPO
 from pace.rl.rollout import Rollout
+from pace.task.env import TableTennisEnv
 
 Call = Callable[[], object]
 
@@ -94,12 +96,25 @@ def rsl_rl_update(options: BenchOptions, algo: AlgoConfig, mixed_precision: bool
     return learner.update
 
 
-def matrix_products(options: BenchOptions, algo: AlgoConfig, device: torch.device) -> Call:
+def product_rates(config: BenchConfig, device: torch.device) -> dict[str, float]:
+    """Samples a second of the matrix products of one pass of the configured training, at its own minibatches: at its
+    steps an update, and at :data:`SELDOM`. Nothing where bf16 has no units."""
+    if compute_dtype("auto", device) != torch.bfloat16:
+        return {}
+    env = TableTennisEnv(config, 2, device, config.seed, None)
+    sizes = Sizes(env.policy_observation.shape[1], env.critic_observation.shape[1], env.action_spec.shape[-1])
+    algos = {"matmul_train": config.algo, "matmul_train_12": replace(config.algo, steps=SELDOM)}
+    calls = {name: matrix_products(config.num_worlds, sizes, algo, device) for name, algo in algos.items()}
+    seconds = median_seconds(calls, config.bench.repeats, device)
+    return {f"{name}_samples_per_s": config.num_worlds * algo.steps / seconds[name] for name, algo in algos.items()}
+
+
+def matrix_products(worlds: int, sizes: Sizes, algo: AlgoConfig, device: torch.device) -> Call:
     """The bf16 matrix products of one pass, forward and backward, over the same minibatches; nothing else."""
-    rows = options.update_worlds * algo.steps // algo.minibatches
+    rows = worlds * algo.steps // algo.minibatches
     networks = [
-        _layers(rows, [options.policy_size, *algo.actor_hidden, options.action_size], device),
-        _layers(rows, [options.critic_size, *algo.critic_hidden, 1], device),
+        _layers(rows, [sizes.policy, *algo.actor_hidden, sizes.actions], device),
+        _layers(rows, [sizes.critic, *algo.critic_hidden, 1], device),
     ]
 
     def run() -> None:
@@ -138,7 +153,8 @@ def update_rates(config: BenchConfig, device: torch.device) -> dict[str, float]:
         measured["ppo_bf16"] = our_update(options, algo, "bf16", device)
         if has_rsl:
             measured["rsl_rl_bf16"] = rsl_rl_update(options, algo, True, device)
-        measured["matmul_bf16"] = matrix_products(options, algo, device)
+        sizes = Sizes(options.policy_size, options.critic_size, options.action_size)
+        measured["matmul_bf16"] = matrix_products(options.update_worlds, sizes, algo, device)
     else:
         print("  bf16 is left out: this hardware has no units for it", flush=True)
     seconds = median_seconds(measured, options.repeats, device)

@@ -14,7 +14,7 @@ from pace.config.training import TrainConfig
 class BenchOptions:
     """Parts and duration of the measurements of ``python -m pace.bench``."""
 
-    parts: list[str]  # of physics, mjwarp, update, train, memory
+    parts: list[str]  # of physics, mjwarp, update, train, neighbours, memory
     repeats: int
     settle_steps: int  # control steps
     control_steps: int
@@ -28,7 +28,7 @@ class BenchOptions:
     memory_updates: int
 
     def __post_init__(self) -> None:
-        known = ("physics", "mjwarp", "update", "train", "memory")
+        known = ("physics", "mjwarp", "update", "train", "neighbours", "memory")
         for part in self.parts:
             require(part in known, f"bench.parts: {part!r} is not one of {', '.join(known)}")
         for name, value in vars(self).items():

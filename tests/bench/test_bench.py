@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
@@ -10,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from pace.bench import physics, report, training
+from pace.bench import neighbours, physics, report, training
 from pace.bench.environment import EnvironmentProcesses
 from pace.bench.measure import measure
 from pace.bench.physics import RawMujoco
@@ -20,6 +22,7 @@ from pace.bench.update import matrix_products
 from pace.config.base import compose, parse
 from pace.config.commands import BenchConfig
 from pace.config.training import load_train_config
+from pace.rl.agent import Sizes
 
 DESIGN_KEYS = {
     "raw_mujoco_steps_per_s",
@@ -42,6 +45,7 @@ PENDULUM = """
   <actuator><position joint="hinge" kp="5"/></actuator>
 </mujoco>
 """
+PAPER = Sizes(410, 465, 21)
 TINY = ["bench=quick", "num_worlds=4", "device=cpu", "bench.update_worlds=4"]
 
 
@@ -166,7 +170,7 @@ def test_raw_limit_steps_every_world_as_mujoco_does() -> None:
 
 def test_matrix_products_are_those_of_one_pass(monkeypatch: pytest.MonkeyPatch) -> None:
     config, algo = bench_config("bench.update_worlds=8"), load_train_config(["algo=paper"]).algo
-    run, operations = matrix_products(config.bench, algo, torch.device("cpu")), []
+    run, operations = matrix_products(config.bench.update_worlds, PAPER, algo, torch.device("cpu")), []
     multiply = torch.mm
 
     def counted(a: torch.Tensor, b: torch.Tensor, out: torch.Tensor) -> torch.Tensor:
@@ -185,6 +189,43 @@ def test_matrix_products_are_those_of_one_pass(monkeypatch: pytest.MonkeyPatch) 
 def test_training_run_that_fails_says_why() -> None:
     with pytest.raises(training.BenchError, match="no_such_device"):
         training.training_run(4, 1, ["device=no_such_device"])
+
+
+def test_the_ideal_loop_steps_physics_and_multiplies_matrices_one_after_the_other() -> None:
+    measured = {"raw_mujoco_steps_per_s": 50_000.0, "matmul_train_samples_per_s": 200_000.0}
+    found = report.ideals(measured, passes=4)
+    assert found == {"train_ideal_steps_per_s": pytest.approx(1.0 / (20e-6 + 4 * 5e-6))}
+    assert report.ideals({"matmul_train_samples_per_s": 1.0}, passes=4) == {}
+    assert report.ratios(found | {"train_steps_per_s": 15_000.0}) == {
+        "train_steps_per_s/train_ideal_steps_per_s": pytest.approx(0.6)
+    }
+
+
+def test_neighbours_keep_cores_busy_while_they_are_measured_and_no_longer(monkeypatch: pytest.MonkeyPatch) -> None:
+    begun: list[tuple[str, ...]] = []
+    seen: list[int] = []
+
+    def measured_run(
+        worlds: int, updates: int, overrides: list[str], prefix: Sequence[str] = ()
+    ) -> tuple[float, float]:
+        begun.append(tuple(prefix))
+        seen.append(len(training._family(os.getpid())))
+        return 100.0 / len(begun), 0.0
+
+    monkeypatch.setattr(neighbours, "training_run", measured_run)
+    monkeypatch.setattr(neighbours, "core_set", lambda: [3, 5])
+    monkeypatch.setattr(neighbours, "_has", lambda program: True)
+    rates = neighbours.neighbour_rates(bench_config(), [])
+    assert [number - seen[0] for number in seen] == [0, 1, 2, 2, 0]
+    assert begun == [(), (), (), ("nice", "-n", "10"), ("taskset", "-c", "3")]
+    assert list(rates.values()) == [100.0, 50.0, 100.0 / 3, 25.0, 20.0]
+    assert set(rates) < set(report.FIGURES)
+
+
+@pytest.mark.slow
+def test_a_program_may_begin_a_measured_run() -> None:
+    with pytest.raises(training.BenchError, match=r"nice -n 7 .*ended with status"):
+        training.training_run(4, 1, ["device=no_such_device"], ("nice", "-n", "7"))
 
 
 def test_overrides_are_dropped_by_key() -> None:
