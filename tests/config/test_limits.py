@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import math
+import pkgutil
 from collections.abc import Iterator
 from copy import deepcopy
 from dataclasses import fields, is_dataclass
@@ -10,7 +12,8 @@ from typing import Any, get_args, get_type_hints
 
 import pytest
 
-from pace.config import automatic, ball, commands, predictor, quality, schedules, sim, task, training
+import pace.config
+from pace.config import ball, predictor, sim, task, training
 from pace.config.base import ConfigError, parse
 from pace.config.limits import LIMITS, first_outside, limits_of
 from pace.config.training import TrainConfig, load_train_config
@@ -19,7 +22,8 @@ from tests.helpers.recipes import defaults
 
 
 def classes() -> list[type]:
-    modules = (automatic, ball, commands, predictor, quality, schedules, sim, task, training)
+    names = [module.name for module in pkgutil.iter_modules(pace.config.__path__, "pace.config.")]
+    modules = [importlib.import_module(name) for name in names]
     found = {cls for module in modules for cls in vars(module).values() if isinstance(cls, type) and is_dataclass(cls)}
     return sorted(found, key=lambda cls: cls.__name__)
 
