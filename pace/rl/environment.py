@@ -30,7 +30,10 @@ def make_env(
     """An environment with the default configuration of ``configs/train.yaml`` and Hydra ``overrides``.
 
     Args:
-        num_worlds, engine, device, seed: as the keys of ``pace train``.
+        num_worlds: as the key of ``pace train``, and so are ``engine``, ``device`` and ``seed``.
+        engine: ``auto``, ``native`` or ``mjwarp``.
+        device: ``auto``, ``cpu`` or ``cuda``.
+        seed: of all random numbers.
         overrides: such as ``["serve=short", "reward.terms.success.weight=200"]``.
         predictor: of the ball's apex, which the actor observes. A run folder, a checkpoint or the name of a published
             policy: its trained predictor, with its configuration. A callable (N, 3 * frames) -> (N, P): used as it is
