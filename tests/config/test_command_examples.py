@@ -11,9 +11,8 @@ from omegaconf import OmegaConf
 from pace.config import commands, page
 from pace.config.base import ConfigError, compose, parse
 from pace.config.limits import first_outside
-from tests.config.test_examples import places, put
-from tests.config.test_limits import leaves
 from tests.helpers.examples import assert_one_line, check, counts_of, st, wrong_values
+from tests.helpers.nested import leaves, places, put
 
 COMMANDS = {
     "evaluate": (commands.EvaluateConfig, ["run=any", "num_worlds=4"]),

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator
-from copy import deepcopy
 from typing import Any
 
 import pytest
@@ -19,6 +17,7 @@ from pace.config.sim import BallConfig, EngineConfig, RandomizationConfig, Robot
 from pace.config.task import ObservationConfig, ResetConfig, RewardConfig, ServeConfig
 from pace.config.training import AlgoConfig, TrainConfig, load_train_config
 from tests.helpers.examples import assert_one_line, check, counts, counts_of, st, wrong_values
+from tests.helpers.nested import places, put
 
 PARTS = {
     "robot": RobotConfig, "ball": BallConfig, "engine": EngineConfig, "serve": ServeConfig, "sensing": SensingConfig,
@@ -26,22 +25,6 @@ PARTS = {
     "observation": ObservationConfig, "predictor": PredictorConfig,
 }  # fmt: skip
 CONFIG = to_dict(load_train_config(["observation=memory", "sensing=mocap"]))
-
-
-def places(tree: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """Of everything in nested dictionaries and lists."""
-    for key, value in tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ():
-        yield (*path, key)
-        yield from places(value, (*path, key))
-
-
-def put(tree: Any, place: tuple[Any, ...], value: Any) -> Any:
-    changed = deepcopy(tree)
-    inner = changed
-    for key in place[:-1]:
-        inner = inner[key]
-    inner[place[-1]] = value
-    return changed
 
 
 @counts_of(60)

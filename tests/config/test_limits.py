@@ -18,6 +18,7 @@ from pace.config.base import ConfigError, parse
 from pace.config.limits import LIMITS, first_outside, limits_of
 from pace.config.training import TrainConfig, load_train_config
 from pace.config.upgrade import upgrade_config
+from tests.helpers.nested import leaves
 from tests.helpers.recipes import defaults
 
 
@@ -44,16 +45,6 @@ def test_every_number_has_a_range() -> None:
     known = {cls.__name__: {field.name for field in fields(cls)} for cls in classes()}
     unknown = [f"{name}.{key}" for name, table in LIMITS.items() for key in table if key not in known[name]]
     assert unknown == []
-
-
-def leaves(tree: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """Places of all numbers in nested dictionaries and lists."""
-    pairs = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
-    for key, value in pairs:
-        if isinstance(value, dict | list):
-            yield from leaves(value, (*path, key))
-        elif isinstance(value, int | float) and not isinstance(value, bool):
-            yield (*path, key)
 
 
 PARTS = {

@@ -26,13 +26,13 @@ def limited(pitch: float, roll: float, pitch_speed: float = 0.0, roll_speed: flo
 
 def test_the_motors_are_those_of_the_joints_limits() -> None:
     motor = ankles.motor()
-    assert (motor.effort, motor.stall, motor.speed, motor.lever) == (12.0, 24.0, 12.9, 0.625)
+    assert (motor.effort, motor.stall, motor.speed, motor.lever) == (12.0, 24.0, 18.8, 0.625)
     assert motor.armature == pytest.approx(0.034)
     assert limited(99.0, 0.0) == (24.0, 0.0)
     assert limited(0.0, -99.0) == (0.0, -15.0)
-    assert limited(-99.0, 0.0, pitch_speed=-12.9) == pytest.approx((0.0, 0.0))
-    assert limited(0.0, 99.0, roll_speed=12.9 / 0.625) == pytest.approx((0.0, 0.0))
-    assert limited(99.0, 0.0, pitch_speed=0.75 * 12.9) == pytest.approx((12.0, 0.0))  # a quarter of the stall torque
+    assert limited(-99.0, 0.0, pitch_speed=-18.8) == pytest.approx((0.0, 0.0))
+    assert limited(0.0, 99.0, roll_speed=18.8 / 0.625) == pytest.approx((0.0, 0.0))
+    assert limited(99.0, 0.0, pitch_speed=0.75 * 18.8) == pytest.approx((12.0, 0.0))  # a quarter of the stall torque
 
 
 def test_torques_within_the_diamond_pass_and_those_beyond_come_to_its_edge() -> None:

@@ -56,7 +56,7 @@ def test_a_recipe_is_whole_and_of_this_version(name: str) -> None:
     run_keys = set(plain) - set(written(name))
     assert run_keys == {
         "device", "processes", "seed", "out", "resume", "init_from", "predictor_from", "checkpoint_minutes",
-        "tensorboard", "progress", "plugins", "plan", "judge",
+        "tensorboard", "logger", "progress", "plugins", "plan", "judge",
     }  # fmt: skip
     assert set(plain["ball"]) - set(written(name)["ball"]) == {"air"}  # of which these balls use nothing
 
