@@ -8,7 +8,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -158,6 +158,7 @@ def test_messages_of_any_kind_change_nothing_and_are_told_in_one_line(
     page: Any, port: int, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     pack = pytest.importorskip("msgspec").msgpack.encode
+    closed = pytest.importorskip("websockets.exceptions").ConnectionClosed
     shared: list[int] = []
     monkeypatch.setattr(page.server, "request_share_url", lambda: shared.append(1))
     state = page._time._impl
@@ -165,10 +166,10 @@ def test_messages_of_any_kind_change_nothing_and_are_told_in_one_line(
     for message in HOSTILE:
         if isinstance(message, dict):
             message = pack({key: value(page) if value is control else value for key, value in message.items()})
-        with connect(port) as connection:
+        with connect(port) as connection, suppress(closed):
             connection.send(pack(CAMERA))
             connection.send(message)
-            connection.recv(timeout=30)
+            connection.recv(timeout=30)  # the scene, or the end of the connection
     with browser(port) as sizes:
         wait(30, lambda: sizes[0] > 10_000)  # the page still plays
         with connect(port) as connection:  # and its controls work
