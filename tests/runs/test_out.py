@@ -65,7 +65,7 @@ def test_a_folder_is_made_and_nothing_is_left_in_it(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("main", "arguments"),
     [
-        (evaluate, ("pretrained/pace", "rows=[mixed]", "serves=100000000", "num_worlds=64")),
+        (evaluate, ("pretrained/pace", "rows=[mixed]", "serves=10000000", "num_worlds=64")),
         (bench, ("bench=quick",)),
         (ablate, ("samples=1e12",)),
         (studies, ("all",)),

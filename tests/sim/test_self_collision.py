@@ -63,7 +63,7 @@ T1_29DOF: dict[str, Case] = {
     "paddle, trunk": (
         ("paddle", "trunk"),
         {"Right_Elbow_Yaw": 2.1, "Right_Shoulder_Roll": -1.0, "Right_Shoulder_Pitch": -2.4},
-        ("Right_Elbow_Pitch", -1.9),
+        ("Right_Elbow_Pitch", -1.65),
         None,
     ),
     "paddle, head": (
