@@ -415,7 +415,7 @@ def test_two_processes_train_and_resume_exactly_and_one_resumes_from_them(tmp_pa
     assert len(alone.training["processes"]) == 1  # type: ignore[index]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_jobs_of_a_sweep_have_separate_workers(tmp_path: Path) -> None:
     """Hydra's ``-m`` runs the command once for each value; a worker simulates the task of its rank 0's job."""
     folder = f"out={tmp_path}/${{seed}}_${{sensing.name}}"

@@ -26,7 +26,7 @@ NOTEBOOKS = {
     ),
 }
 #: Those that `make test` has the time for.
-QUICK = ("01_physics.ipynb", "02_policy.ipynb")
+QUICK = ("01_physics.ipynb",)
 LARGEST = 500_000  # bytes of a stored notebook
 
 

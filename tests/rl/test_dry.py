@@ -304,7 +304,7 @@ def test_the_command_ends_bit_for_bit_as_the_same_run_unreplayed(
     assert rows[0]["stage"] == [0.0] * 12 + [1.0] * 4
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_command_resumes_exactly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     assert train(monkeypatch, *TRAINED, f"out={whole}", "samples=1024") == 0

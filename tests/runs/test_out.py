@@ -239,6 +239,7 @@ def test_every_command_asks_before_its_work(
     assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [(name, "mine")]
 
 
+@pytest.mark.long
 def test_an_evaluation_may_be_repeated_in_its_folder(tmp_path: Path) -> None:
     small = ("policy=zero", "rows=[short]", "serves=2", "num_worlds=2", "warmup_serves=0", "physics_dt=0.02")
     small += ("first_ball=[]", "progress=false", "serve.max_duration=0.3", "device=cpu", f"out={tmp_path}")
