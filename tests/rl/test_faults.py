@@ -224,7 +224,7 @@ def test_others_can_read_a_checkpoint_as_far_as_the_user_lets_them(tmp_path: Pat
 
 
 LEARNER = ("algo.steps=12", "algo.actor_hidden=[32]", "algo.critic_hidden=[32]", "predictor.batches_per_update=2")
-#: A run of some minutes on a busy machine would be judged, and its metrics would have what those of a short one have not.
+#: A run of some minutes on a busy machine would be judged, and its metrics would have what a short one's have not.
 TINY = ("num_worlds=8", "engine.threads=1", "minutes=0", "tensorboard=true", "judge.after=1e6", *LEARNER)
 
 
