@@ -25,7 +25,7 @@ from torch import Tensor
 
 from pace.config.automatic import SHARE_OF_MEMORY, memory_needed
 from pace.cores import threads_of, usable_cores
-from pace.exchange import MOST, Exchange, Shared, nobody_failed
+from pace.exchange import MOST, Exchange, Shared
 from pace.memory import available_memory
 
 T = TypeVar("T")
@@ -156,7 +156,7 @@ def process_group(size: int, device: torch.device, command: Sequence[str] | None
         store.set(f"here/{rank}", "")
         shared = Shared.inherited(os.environ[SHARED]) if SHARED in os.environ else None
         with _connected(device, store=store, rank=rank, world_size=size):
-            yield ProcessGroup(rank, size, _exchange(shared, rank, size))
+            yield ProcessGroup(rank, size, Exchange(rank, shared) if shared else None)
     elif under_torchrun():
         with _connected(device):
             yield ProcessGroup(dist.get_rank(), dist.get_world_size())
@@ -170,13 +170,7 @@ def process_group(size: int, device: torch.device, command: Sequence[str] | None
         with _Workers(size, store.port, threads, command or this_command(), shared) as workers:
             workers.wait_for(store)
             with _connected(device, store=store, rank=0, world_size=size), workers.explaining():
-                yield ProcessGroup(0, size, _exchange(shared, 0, size, workers.require_none_failed))
-
-
-def _exchange(
-    shared: Shared | None, rank: int, size: int, require_all: Callable[[], None] = nobody_failed
-) -> Exchange | None:
-    return None if shared is None else Exchange(rank, size, shared.memory, shared.pipes, require_all)
+                yield ProcessGroup(0, size, Exchange(0, shared, workers.require_none_failed) if shared else None)
 
 
 def under_torchrun() -> bool:
@@ -223,11 +217,10 @@ class _Workers:
 
     def __init__(self, size: int, port: int, threads: int, command: Sequence[str], shared: Shared | None) -> None:
         self._open = ExitStack()
-        files: list[int] = []
-        of_shared: dict[str, str] = {}
         if shared is not None:
             self._open.callback(shared.close)
-            files, of_shared = shared.numbers(), {SHARED: shared.describe()}
+        files = shared.numbers() if shared else []
+        of_shared = {SHARED: shared.describe()} if shared else {}
         self._logs: dict[int, IO[str]] = {}
         self._started: dict[int, subprocess.Popen[str]] = {}
         for rank in range(1, size):

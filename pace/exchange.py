@@ -29,24 +29,16 @@ def nobody_failed() -> None:
 
 
 class Exchange:
-    """Rank ``rank`` of ``size`` processes that have inherited the file ``memory`` and a pipe a rank.
+    """Rank ``rank`` of the processes that have the files ``shared``. All of them send the same messages in the same
+    order.
 
-    All of them send the same messages in the same order.
-
-    Args: pipes: read and write end a rank, of which each process reads its own. require_all: called while it waits,
-    every half second; raises if a process has failed.
+    Args: require_all: called while it waits, every half second; raises if a process has failed.
     """
 
-    def __init__(
-        self,
-        rank: int,
-        size: int,
-        memory: int,
-        pipes: list[tuple[int, int]],
-        require_all: Callable[[], None] = nobody_failed,
-    ) -> None:
-        self._rank, self._size, self._require_all = rank, size, require_all
-        mapped = mmap.mmap(memory, SETS * size * CAPACITY)
+    def __init__(self, rank: int, shared: Shared, require_all: Callable[[], None] = nobody_failed) -> None:
+        self._rank, self._require_all = rank, require_all
+        pipes, size = shared.pipes, len(shared.pipes)
+        mapped = mmap.mmap(shared.memory, SETS * size * CAPACITY)
         self._slots = torch.frombuffer(mapped, dtype=torch.uint8).view(SETS, size, CAPACITY)
         self._inbox = pipes[rank][0]
         self._outboxes = [pipes[other][1] for other in range(size) if other != rank]
@@ -92,14 +84,17 @@ class Exchange:
 
 
 class Shared:
-    """The files of an :class:`Exchange` of ``size`` processes, which rank 0 opens and the others inherit."""
+    """The files of an :class:`Exchange`, which rank 0 opens and the others inherit.
+
+    Args: memory: of all slots; pipes: read and write end of a pipe a rank, of which each process reads its own.
+    """
 
     def __init__(self, memory: int, pipes: list[tuple[int, int]]) -> None:
         self.memory, self.pipes = memory, pipes
 
     @classmethod
     def open(cls, size: int) -> Shared:
-        """New files. Errors: :class:`OSError` if the system grants none."""
+        """New files for ``size`` processes. Errors: :class:`OSError` if the system grants none."""
         if hasattr(os, "memfd_create"):
             memory = os.memfd_create("pace")
         else:

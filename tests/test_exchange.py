@@ -17,9 +17,9 @@ MEMBER = textwrap.dedent(
     """
     import sys, time, torch
     from pace.exchange import Exchange, Shared
-    rank, size, rounds = (int(text) for text in sys.argv[1:4])
-    shared = Shared.inherited(sys.argv[4])
-    exchange = Exchange(rank, size, shared.memory, shared.pipes)
+    rank, rounds = (int(text) for text in sys.argv[1:3])
+    shared = Shared.inherited(sys.argv[3])
+    exchange = Exchange(rank, shared)
     generator = torch.Generator().manual_seed(rank)
     for index in range(rounds):
         if (index + rank) % 7 == 0:
@@ -52,7 +52,7 @@ def test_every_process_receives_the_same_sums_bit_for_bit(size: int) -> None:
     command = [sys.executable, "-c", MEMBER]
     members = [
         subprocess.Popen(
-            [*command, str(rank), str(size), str(rounds), shared.describe()],
+            [*command, str(rank), str(rounds), shared.describe()],
             pass_fds=shared.numbers(),
             stdout=subprocess.PIPE,
             text=True,
@@ -66,7 +66,7 @@ def test_every_process_receives_the_same_sums_bit_for_bit(size: int) -> None:
 
 
 def alone(shared: Shared, **kwargs: object) -> Exchange:
-    return Exchange(0, 2, shared.memory, shared.pipes, **kwargs)  # type: ignore[arg-type]
+    return Exchange(0, shared, **kwargs)  # type: ignore[arg-type]
 
 
 def test_who_waits_for_a_process_that_is_gone_is_told() -> None:
@@ -83,7 +83,7 @@ def test_who_waits_for_a_process_that_is_gone_is_told() -> None:
 
 def test_a_sum_is_that_of_its_own_message_although_later_ones_are_sent() -> None:
     shared = Shared.open(2)
-    mine, theirs = alone(shared), Exchange(1, 2, shared.memory, shared.pipes)
+    mine, theirs = alone(shared), Exchange(1, shared)
     for start in range(0, 40, OUTSTANDING):
         sent = [
             [torch.full((4,), float(index + shift)) for index in range(start, start + OUTSTANDING)]

@@ -12,7 +12,7 @@ import torch
 import warp as wp
 
 import pace
-from pace.task.env import make_env
+from tests.helpers.envs import make_env
 
 ROOT = Path(pace.__file__).parent
 ARCHITECTURES = (80, 90, 100)  # A100, H100, B200

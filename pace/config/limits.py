@@ -178,11 +178,8 @@ LIMITS: dict[str, dict[str, Limits]] = {
     "ExportConfig": {
         "check_worlds": (1, 2**20), "check_steps": (1, 10**6), "tolerance": (TINY, 1e3), "seed": SEED
     },
-    "PlayConfig": {
-        "port": (1, 65_535), "speed": (1e-3, 1.0), "seed": SEED, "physics_dt": STEP, "seconds": (TINY, 1e6),
-        "width": (2, 16_384), "height": (2, 16_384), "fps": (1, 1000),
-    },
-    "WatchConfig": {"port": (1, 65_535), "speed": (1e-3, 1.0), "seed": SEED, "physics_dt": STEP},
+    "PageConfig": {"port": (1, 65_535), "speed": (1e-3, 1.0), "seed": SEED, "physics_dt": STEP},
+    "PlayConfig": {"seconds": (TINY, 1e6), "width": (2, 16_384), "height": (2, 16_384), "fps": (1, 1000)},
     "RetraceConfig": {"tolerance": (TINY, 1e3), "late": (TINY, 1e3)},
     "AblateConfig": {"seeds": SEED, "samples": (1.0, 1e15), "jobs": (1, 4096), "window": (TINY, 1e15)},
     "CompareConfig": {

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from pace.deploy.player import CONTRACT, SHARED
 from pace.runs.files import write_whole
 
-FILE = "policy.json"
 STEPS = 16  # of the examples, from a state of zeros on
 DIGITS = 6  # of the examples' numbers
 

@@ -24,9 +24,8 @@ from pace.config.base import compose, parse, to_dict
 from pace.config.commands import ExportConfig
 from pace.config.extras import cure
 from pace.config.training import TrainConfig
-from pace.deploy import contract
 from pace.deploy.check import compare, open_session
-from pace.deploy.contract import write_contract
+from pace.deploy.contract import STEPS, write_contract
 from pace.deploy.graph import (
     DeployedPolicy,
     input_ports,
@@ -37,13 +36,13 @@ from pace.deploy.graph import (
 from pace.deploy.player import FORMAT
 from pace.onboard.estimate import columns
 from pace.rl.policies import TaskPolicy, load_policy
+from pace.runs.exported import CONTRACT_FILE, POLICY_FILE
 from pace.runs.own_files import make_out
 from pace.runs.run_folder import VERSIONS, versions
 from pace.sim.robot import build_model, joint_armature, joint_friction, joint_gains, motor_lines, nominal_pose
 from pace.sim.robot_spec import RobotSpec
 from pace.task.observations import POLICY, layout
 
-FILE = "policy.onnx"  # in the folder that the command writes
 #: What lies outside the file.
 PROCEDURE = (
     "Run at 1 / control_dt Hz: give the current readings, and as state the state_next of the call before. A state of "
@@ -65,7 +64,7 @@ def export_from_config(composed: DictConfig) -> None:
     policy = load_policy(config.run)
     if config.out and Path(config.out).suffix == ".onnx":
         raise ExportError(f"out={config.out} must be a folder, in which policy.onnx is written")
-    out = make_out(config.out, "export", [FILE, contract.FILE]) / FILE
+    out = make_out(config.out, "export", [POLICY_FILE, CONTRACT_FILE]) / POLICY_FILE
     differences = export_policy(policy, out, config)
     count = config.check_worlds * config.check_steps
     units = {name: port.unit for name, port in output_ports(policy.config).items()}
@@ -82,8 +81,8 @@ def export_run(run: Path) -> Path:
     Errors: :class:`ExportError`.
     """
     usual = parse(compose("export", [f"run='{run}'"]), ExportConfig)
-    export_policy(load_policy(run), run / FILE, usual)
-    return run / FILE
+    export_policy(load_policy(run), run / POLICY_FILE, usual)
+    return run / POLICY_FILE
 
 
 def export_policy(policy: TaskPolicy, out: Path, config: ExportConfig) -> dict[str, float]:
@@ -109,7 +108,7 @@ def export_policy(policy: TaskPolicy, out: Path, config: ExportConfig) -> dict[s
                 raise ExportError(f"onnxruntime and torch differ by {largest:.2g}, more than {config.tolerance:g}")
             content = metadata(policy, model, differences, config)
             describe(file, content)
-            beside = write_contract(file, content, session, frames[: contract.STEPS], config.tolerance)
+            beside = write_contract(file, content, session, frames[:STEPS], config.tolerance)
             file.replace(out)
             beside.replace(out.with_suffix(".json"))
     except OSError as error:

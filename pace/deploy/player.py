@@ -128,7 +128,7 @@ def _open(file: Path) -> Any:
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     try:
         return onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
-    except (*unreadable, ort.Fail) as error:
+    except unreadable as error:
         raise ValueError(str(error).splitlines()[0]) from error
 
 

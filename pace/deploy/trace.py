@@ -15,11 +15,11 @@ from pace.config.base import parse
 from pace.config.commands import RetraceConfig
 from pace.config.extras import cure
 from pace.deploy.player import Controller, read_log
+from pace.runs.exported import POLICY_FILE
 from pace.runs.files import reason, write_figure
 from pace.runs.own_files import started_out
 
 FIGURE = "retrace.png"
-POLICY = "policy.onnx"
 JOINTS_TOLD = 5  # of those that differ most
 SMALLEST = 1e-8  # rad; the figure's lower end
 
@@ -137,7 +137,7 @@ def retrace_from_config(composed: DictConfig) -> None:
     assert config.policy is not None  # guaranteed by RetraceConfig, as is the log
     assert config.log is not None
     file = Path(config.policy)
-    file = file / POLICY if file.is_dir() else file
+    file = file / POLICY_FILE if file.is_dir() else file
     try:
         controller = Controller(file)
     except ValueError as error:

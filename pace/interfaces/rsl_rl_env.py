@@ -13,6 +13,7 @@ from torch import Tensor
 from pace.config.base import to_dict
 from pace.config.task import ServeConfig
 from pace.rl.rates import rates
+from pace.runs.reading import read
 from pace.task.env import TableTennisEnv
 
 #: Control steps between two logs of rates, 0.5 s: in fewer steps few serves end.
@@ -69,8 +70,7 @@ class RslRlEnv(VecEnv):
         self._steps += 1
         if self._steps % self._log_every:
             return {}
-        sums = {name: float(value) for name, value in self.env.pop_statistics().items()}
-        found = rates(sums, self.env.worlds.control_dt)
+        found = rates(read(self.env.pop_statistics()), self.env.worlds.control_dt)
         shown = ("hit_rate", "success_rate", "fall_rate", *(name for name in found if name.startswith("reward/")))
         return {"log": {f"/{name}": found[name] for name in shown if not math.isnan(found[name])}}
 

@@ -47,10 +47,11 @@ from pace.rl.start import other_choices
 from pace.rl.trainer import Summary, Trainer, device_type_of, restarts_worlds
 from pace.runs.checkpoint import Checkpoint, CheckpointError, load_checkpoint
 from pace.runs.checkpoint_folders import FOLDER, NAME
+from pace.runs.exported import CONTRACT_FILE, POLICY_FILE
 from pace.runs.files import tell
 from pace.runs.interrupt import terminable
 from pace.runs.learning_curve import CURVE
-from pace.runs.run_folder import CONTRACT, EVALUATION, FILM, POLICY, RunFolder, is_run
+from pace.runs.run_folder import EVALUATION, FILM, RunFolder, is_run
 
 if TYPE_CHECKING:
     from pace.task.env import TableTennisEnv
@@ -58,8 +59,8 @@ if TYPE_CHECKING:
 #: Makes the judge of a run.
 MakeJudge = Callable[[JudgeConfig], Judge]
 COMMAND = "pace.rl.train"
-OWN = (FILM, EVALUATION, POLICY, CONTRACT)  # files of a run besides those of every run
-UPLOADED = (FILM, CURVE, POLICY, CONTRACT)  # to a logger, at the end of a run
+OWN = (FILM, EVALUATION, POLICY_FILE, CONTRACT_FILE)  # files of a run besides those of every run
+UPLOADED = (FILM, CURVE, POLICY_FILE, CONTRACT_FILE)  # to a logger, at the end of a run
 SEEDS_APART = 1_000_003  # between the stages of a curriculum: further than seeds of runs lie apart
 
 

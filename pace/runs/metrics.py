@@ -89,9 +89,7 @@ def last_row(file: Path) -> dict[str, float]:
         with file.open("rb") as handle:
             head = handle.readline()
             handle.seek(max(len(head), handle.seek(0, os.SEEK_END) - LONGEST_ROW))
-            rows = (
-                handle.read().decode(errors="replace").split("\n")[:-1]
-            )  # the part after the last line end is unfinished
+            *rows, _ = handle.read().decode(errors="replace").split("\n")  # the end of the last row may be missing
     except OSError:
         return {}
     names, cells = head.decode(errors="replace").strip().split(","), rows[-1].split(",") if rows else []

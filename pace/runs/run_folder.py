@@ -34,7 +34,6 @@ CHECKPOINTS_KEPT = 4
 REPLAYS, REPLAY_SUFFIX, MOST_REPLAYS = "replays", ".replay", 16
 CONFIG, VERSIONS, METRICS, EVENTS = "config.yaml", "versions.json", "metrics.csv", "events"
 FILM, EVALUATION = "play.mp4", "evaluation"  # of a training run that has come to its end
-POLICY, CONTRACT = "policy.onnx", "policy.json"  # likewise, with a logger that takes them
 FILES = (CONFIG, VERSIONS, METRICS, CURVE)  # of every run
 PACKAGES = ("torch", "torchrl", "tensordict", "mujoco", "mujoco-warp", "warp-lang", "numpy", "hydra-core")
 LEFTOVER = re.compile(r"\.(config\.yaml|versions\.json|metrics\.csv)\.\d+\.tmp")  # of a kill while a file was written

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -99,21 +98,3 @@ class TableTennisEnv(TableTennis, EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
             self.generator.manual_seed(seed)
-
-
-def make_env(
-    num_worlds: int = 64,
-    engine: str = "auto",
-    device: str = "auto",
-    seed: int = 1,
-    overrides: Sequence[str] = (),
-    predictor: Predictor | None = None,
-) -> TableTennisEnv:
-    """An environment with the default configuration of ``configs/train.yaml`` and Hydra ``overrides``.
-
-    Errors: :class:`pace.config.ConfigError` for a wrong key or value, an engine or a device that is not there.
-    """
-    from pace.config.training import load_train_config
-
-    config = load_train_config([f"num_worlds={num_worlds}", f"engine={engine}", f"seed={seed}", *overrides])
-    return TableTennisEnv(config, num_worlds, device, seed, predictor)

@@ -12,7 +12,7 @@ from pace.config import commands, page
 from pace.config.base import ConfigError, compose, parse
 from pace.config.limits import first_outside
 from tests.helpers.examples import assert_one_line, check, counts_of, st, wrong_values
-from tests.helpers.nested import leaves, places, put
+from tests.helpers.nested import changed, leaves, places, put
 
 COMMANDS = {
     "evaluate": (commands.EvaluateConfig, ["run=any", "num_worlds=4"]),
@@ -42,14 +42,8 @@ def test_a_command_with_wrong_values_is_valid_or_one_line(command: str, count: i
 
     @check(count, st.lists(st.tuples(st.sampled_from(known), wrong_values()), min_size=1, max_size=3))
     def example(changes: list[tuple[tuple[Any, ...], Any]]) -> None:
-        changed = given
-        for place, value in changes:
-            try:
-                changed = put(changed, place, value)
-            except (KeyError, TypeError, IndexError):  # the place has gone with an earlier change
-                continue
         try:
-            parsed = parse(changed, schema)
+            parsed = parse(changed(given, changes), schema)
         except ConfigError as error:
             assert_one_line(error)
             refused.append(error)

@@ -13,16 +13,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pace.config.base import compose, parse
-from pace.config.commands import ExportConfig, RetraceConfig
+from pace.config.commands import RetraceConfig
 from pace.deploy.contract import STEPS
-from pace.deploy.export import export_policy
 from pace.deploy.player import SHARED, Controller, Log, read_log
 from pace.deploy.retrace import main
 from pace.deploy.trace import report, retrace
 from pace.rl.policies import load_policy
 from tests.helpers.examples import assert_one_line, check, counts, json_values, st
-from tests.helpers.saved import save_run
+from tests.helpers.saved import export_quickly, save_run
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "deploy_sim2sim.py"
 
@@ -30,11 +28,8 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "deploy_sim2sim.py"
 @pytest.fixture(scope="module")
 def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An exported policy, with its contract."""
-    pytest.importorskip("onnxscript")
-    file = tmp_path_factory.mktemp("robot") / "policy.onnx"
-    small = ["run=any", "check_worlds=2", "check_steps=30"]
-    export_policy(load_policy(save_run(file.parent / "run")), file, parse(compose("export", small), ExportConfig))
-    return file
+    folder = tmp_path_factory.mktemp("robot")
+    return export_quickly(load_policy(save_run(folder / "run")), folder)
 
 
 @pytest.fixture

@@ -2,43 +2,25 @@
 
 from __future__ import annotations
 
-import sys
-from importlib.util import module_from_spec, spec_from_file_location
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from pace.config.base import compose, parse
-from pace.config.commands import ExportConfig
-from pace.deploy.export import export_policy
+from pace.deploy.player import Controller
 from tests.helpers.examples import assert_one_line, check, counts_of, st
-from tests.helpers.saved import remembering_policy
-
-EXAMPLE = Path(__file__).parents[2] / "examples" / "deploy_sim2sim.py"
+from tests.helpers.saved import export_quickly, remembering_policy
 
 
 @pytest.fixture(scope="module")
-def controller(tmp_path_factory: pytest.TempPathFactory) -> Any:
+def controller(tmp_path_factory: pytest.TempPathFactory) -> Controller:
     """Of a policy that remembers its returns, and uses all that it estimates."""
-    pytest.importorskip("onnxscript")
-    file = tmp_path_factory.mktemp("robot") / "policy.onnx"
-    small = ["run=any", "check_worlds=2", "check_steps=30"]
-    export_policy(remembering_policy(), file, parse(compose("export", small), ExportConfig))
-    spec = spec_from_file_location("deploy_sim2sim_of_examples", EXAMPLE)
-    assert spec is not None
-    assert spec.loader is not None
-    module = module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module.Controller(file)
+    return Controller(export_quickly(remembering_policy(), tmp_path_factory.mktemp("robot")))
 
 
-def ordinary(controller: Any) -> dict[str, Any]:
+def ordinary(controller: Controller) -> dict[str, Any]:
     """Readings of a robot that stands and sees a ball."""
-    sizes = {name: port["size"] for name, port in controller.meta["inputs"].items() if name != "state"}
-    frame = {name: np.zeros(size) for name, size in sizes.items()}
+    frame: dict[str, Any] = {name: np.zeros(size) for name, size in controller.sizes.items()}
     frame["joint_position"] = np.array(controller.meta["nominal_pose"])
     frame["base_position"] = np.array([-1.8, 0.3, 0.66])
     frame["projected_gravity"], frame["heading"] = np.array([0.0, 0.0, -1.0]), np.array([1.0, 0.0])
@@ -65,13 +47,13 @@ WHOLE = st.one_of(
 )
 
 
-def within_range(controller: Any, target: Any) -> bool:
+def within_range(controller: Controller, target: Any) -> bool:
     reach = controller.meta["action_scale"] * controller.meta["action_clip"]
     return bool((np.abs(target - np.array(controller.meta["nominal_pose"])) <= reach + 1e-4).all())
 
 
 @counts_of(500)
-def test_numbers_of_any_size_give_targets_in_their_range_or_one_error(controller: Any, count: int) -> None:
+def test_numbers_of_any_size_give_targets_in_their_range_or_one_error(controller: Controller, count: int) -> None:
     names = sorted(ordinary(controller))
     refused: list[str] = []
     moved: list[int] = []
@@ -100,7 +82,7 @@ def test_numbers_of_any_size_give_targets_in_their_range_or_one_error(controller
 
 
 @counts_of(500)
-def test_readings_of_any_kind_give_one_error(controller: Any, count: int) -> None:
+def test_readings_of_any_kind_give_one_error(controller: Controller, count: int) -> None:
     names = [*sorted(ordinary(controller)), "speed", "state", ""]
 
     @check(count, st.dictionaries(st.sampled_from(names), WHOLE, min_size=1, max_size=3), st.booleans())
@@ -125,7 +107,7 @@ def test_readings_of_any_kind_give_one_error(controller: Any, count: int) -> Non
         ({"speed": [1.0]}, "the reading speed is no input of the file"),
     ],
 )
-def test_what_is_wrong_is_named(controller: Any, changes: dict[str, Any], words: str) -> None:
+def test_what_is_wrong_is_named(controller: Controller, changes: dict[str, Any], words: str) -> None:
     with pytest.raises(ValueError, match=words):
         controller(ordinary(controller) | changes)
     with pytest.raises(ValueError, match="the reading ball_age is missing"):

@@ -18,7 +18,7 @@ from pace.evaluation import publish
 from pace.evaluation.keep import main
 from pace.evaluation.publish import KeepError, keep
 from pace.rl.policies import load_policy
-from pace.runs.checkpoint import export_weights
+from pace.runs.checkpoint import export_weights, load_checkpoint, save_checkpoint
 from pace.runs.own_files import LIST
 from pace.runs.whole_folder import LOCK, clear_leftovers, replaced
 from tests.helpers.saved import save_run
@@ -174,6 +174,22 @@ def test_a_published_policy_is_replaced_and_other_files_in_it_stay(tmp_path: Pat
     assert not (kept / "evaluation.json").exists()  # it was of the policy before
     assert (kept / "notes.txt").read_text() == "mine"
     assert {path.name for path in tmp_path.iterdir()} == {"run", "kept", "evaluation.json"}
+
+
+def test_a_training_that_is_kept_goes_when_its_policy_is_done(tmp_path: Path) -> None:
+    run, kept = save_run(tmp_path / "run"), tmp_path / "kept"
+    newest = load_checkpoint(run)
+    assert newest.path is not None
+    newest.training = {"algorithm": {"moment": torch.ones(3)}, "processes": [{"env": torch.zeros(9)}]}
+    save_checkpoint(newest.path, newest)
+    keep(run, kept, training=True)
+    training = load_checkpoint(kept).training
+    assert training is not None
+    assert training["algorithm"]["moment"].tolist() == [1.0, 1.0, 1.0]
+    assert training["processes"] == []
+    keep(run, kept)
+    assert load_checkpoint(kept).training is None
+    assert "training.safetensors" not in files_of(kept)
 
 
 def test_the_policies_of_the_repository_can_be_replaced(tmp_path: Path) -> None:

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from pace.onboard.estimate import Estimate
 from pace.onboard.estimates import ESTIMATES
-from pace.task.env import TableTennisEnv, make_env
+from pace.task.env import TableTennisEnv
+from tests.helpers.envs import make_env
 
 
 class Running:

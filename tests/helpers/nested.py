@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from copy import deepcopy
 from typing import Any
 
@@ -31,3 +31,13 @@ def leaves(tree: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
             yield from leaves(value, (*path, key))
         elif isinstance(value, int | float) and not isinstance(value, bool):
             yield (*path, key)
+
+
+def changed(tree: Any, changes: Iterable[tuple[tuple[Any, ...], Any]]) -> Any:
+    """A copy with these values at these places, one after another, without those that went with an earlier one."""
+    for place, value in changes:
+        try:
+            tree = put(tree, place, value)
+        except (KeyError, TypeError, IndexError):
+            continue
+    return tree

@@ -6,11 +6,14 @@ from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
+import pytest
 import torch
 from torch import Tensor
 
-from pace.config.base import to_dict
+from pace.config.base import compose, parse, to_dict
+from pace.config.commands import ExportConfig
 from pace.config.training import TrainConfig, load_train_config
+from pace.deploy.export import export_policy
 from pace.predictor.network import PredictorNetwork
 from pace.rl.agent import Agent, Policy
 from pace.rl.policies import TaskPolicy, load_policy, policy_size
@@ -81,3 +84,12 @@ def remembering_policy(weight: float = 0.01) -> TaskPolicy:
         weights[name] = wide
     network.load_state_dict(weights)
     return TaskPolicy(config, network.requires_grad_(False).eval(), old.predictor, "remembering")
+
+
+def export_quickly(policy: TaskPolicy, folder: Path) -> Path:
+    """An exported policy with its contract, checked on few observations; skips where the packages are missing."""
+    pytest.importorskip("onnxscript")
+    file = folder / "policy.onnx"
+    small = ["run=any", "check_worlds=2", "check_steps=30"]
+    export_policy(policy, file, parse(compose("export", small), ExportConfig))
+    return file

@@ -16,8 +16,8 @@ from pace.config.base import ConfigError
 from pace.config.task import AttitudeEstimateConfig
 from pace.onboard.attitude import AttitudeEstimate
 from pace.onboard.kinematics import to_world
-from pace.task.env import make_env
 from pace.task.observations import check_policy
+from tests.helpers.envs import make_env
 from tests.helpers.estimates import Running, check_observed_kept_and_begun
 from tests.helpers.fakes import config
 

@@ -13,8 +13,8 @@ from torch import Tensor
 from pace.config.base import ConfigError
 from pace.config.task import DelayEstimateConfig
 from pace.onboard.delay import DelayEstimate
-from pace.task.env import make_env
 from pace.task.observations import check_policy
+from tests.helpers.envs import make_env
 from tests.helpers.estimates import Running, check_observed_kept_and_begun, estimated
 from tests.helpers.fakes import config
 

@@ -14,8 +14,8 @@ from scipy.linalg import solve_discrete_are
 from pace.config.base import ConfigError
 from pace.config.task import JointEstimateConfig
 from pace.onboard.joints import JointEstimate, steady_gain
-from pace.task.env import make_env
 from pace.task.observations import check_policy
+from tests.helpers.envs import make_env
 from tests.helpers.estimates import Running, check_observed_kept_and_begun, estimated
 from tests.helpers.fakes import config
 

@@ -12,8 +12,8 @@ from pace.config.base import ConfigError
 from pace.config.task import ReturnMemoryConfig
 from pace.onboard.returns import ReturnMemory
 from pace.sim.ball.aero import GRAVITY
-from pace.task.env import make_env
 from pace.task.observations import check_policy
+from tests.helpers.envs import make_env
 from tests.helpers.estimates import estimated
 from tests.helpers.fakes import config
 from tests.helpers.hits import DT, POINT, Rally

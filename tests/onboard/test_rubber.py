@@ -10,8 +10,8 @@ from torch import Tensor
 
 from pace.config.base import ConfigError
 from pace.onboard.rubber import RubberMemory
-from pace.task.env import make_env
 from pace.task.observations import check_policy
+from tests.helpers.envs import make_env
 from tests.helpers.estimates import estimated
 from tests.helpers.fakes import config
 from tests.helpers.hits import DT, Rally

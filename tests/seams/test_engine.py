@@ -11,7 +11,8 @@ import torch
 from pace.config.base import ConfigError
 from pace.rl.policies import load_policy
 from pace.rl.train import main as train
-from pace.task.env import TableTennisEnv, make_env
+from pace.task.env import TableTennisEnv
+from tests.helpers.envs import make_env
 from tests.helpers.outside import SMALL, command, stranger, write_module
 
 PUPPET = """

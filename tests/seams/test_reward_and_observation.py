@@ -18,10 +18,10 @@ from pace.rl.train import main as train
 from pace.runs.checkpoint import CheckpointError
 from pace.runs.metrics import read_metrics
 from pace.runs.queue import Run, check_settings
-from pace.task.env import make_env
 from pace.task.observations import POLICY
 from pace.task.rewards import TERMS
 from pace.viewer.playback import Show
+from tests.helpers.envs import make_env
 from tests.helpers.outside import SMALL, command, python, stranger, write_module
 from tests.helpers.saved import save_run
 

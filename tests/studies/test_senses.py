@@ -10,7 +10,7 @@ import torch
 
 from pace.config.base import ConfigError
 from pace.studies import senses
-from pace.task.env import make_env
+from tests.helpers.envs import make_env
 from tests.helpers.estimates import estimated
 from tests.helpers.saved import save_run
 
