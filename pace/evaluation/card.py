@@ -69,10 +69,15 @@ def _evaluation(folder: Path, found: Mapping[str, Any]) -> str:
     fixed += [f"{key}={found[key]}" for key in ("physics_dt", "num_worlds", "warmup_serves", "seed")]
     serves = f"serves={min(row['serves'] for row in found['rows'])}"
     command = " ".join(["python -m pace.evaluation", f"pretrained/{folder.name}", *fixed, serves, *overrides])
-    table = markdown_table(
+    parts = ["## Evaluation", f"`{command}`", serves_table(found), *more_tables(found, markdown_table)]
+    return "\n\n".join(parts)
+
+
+def serves_table(found: Mapping[str, Any]) -> str:
+    """The serve ranges of an evaluation with their rates."""
+    return markdown_table(
         ("serves", "number", "hit %", "success %", "falls per 1,000"), [_row(row) for row in found["rows"]]
     )
-    return "\n\n".join(["## Evaluation", f"`{command}`", table, *more_tables(found, markdown_table)])
 
 
 def _sweep(found: Mapping[str, Any]) -> str:

@@ -399,6 +399,7 @@ def test_an_interrupted_sweep_keeps_its_cells_and_goes_on(
     assert len(json.loads((tmp_path / "sweep.json").read_text())["cells"]) == 5
 
 
+@pytest.mark.long
 def test_a_sweep_has_the_first_balls_and_takes_those_of_the_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -160,6 +160,7 @@ def test_worlds_follow_from_balls_a_world() -> None:
     assert config_of("balls_per_world=3").worlds_for(10) == 4
 
 
+@pytest.mark.long
 def test_the_referees_rows_change_what_they_name() -> None:
     task = load_train_config()
     cells = {cell.value: cell for cell in variations(task, config_of().variations, "referee")}

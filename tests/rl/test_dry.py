@@ -284,7 +284,7 @@ def train(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     return main()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_command_ends_bit_for_bit_as_the_same_run_unreplayed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
